@@ -1,0 +1,1 @@
+"""Words for people: message catalogues, one file a language."""

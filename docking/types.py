@@ -1,0 +1,297 @@
+"""The nouns that flow through the house: points -> screened -> fit -> correction -> plan -> set-points -> feedback.
+
+All are frozen; arrays are float64 and read-only. Lengths are mm, angles rad, times s, forces N.
+Frames: W assembly (cell), T tracker station, C component, M mate. `X_AB` is the pose of frame B in frame A,
+so `p_A = X_AB.apply(p_B)` and `X_AC = X_AB @ X_BC`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from enum import Enum
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def readonly(values: ArrayLike) -> Array:
+    """Return a read-only float64 copy of `values`."""
+    array = np.array(values, dtype=np.float64)
+    array.setflags(write=False)
+    return array
+
+
+class _Frozen:
+    """Base of the nouns: every ndarray field becomes a read-only float64 copy."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        for item in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, item.name)
+            if isinstance(value, np.ndarray):
+                object.__setattr__(self, item.name, readonly(value))
+
+
+@dataclass(frozen=True, eq=False)
+class Pose(_Frozen):
+    """A rigid pose X_AB: rotation `R` (3, 3), translation `t_mm` (3,): `p_A = R p_B + t`."""
+
+    R: Array
+    t_mm: Array
+
+    @staticmethod
+    def identity() -> Pose:
+        return Pose(np.eye(3), np.zeros(3))
+
+    @staticmethod
+    def from_matrix(matrix: ArrayLike) -> Pose:
+        """Pose from a homogeneous (4, 4) matrix."""
+        m = np.asarray(matrix, dtype=np.float64)
+        return Pose(m[:3, :3], m[:3, 3])
+
+    def matrix(self) -> Array:
+        """Homogeneous (4, 4) matrix."""
+        m = np.eye(4)
+        m[:3, :3] = self.R
+        m[:3, 3] = self.t_mm
+        return m
+
+    def apply(self, points_mm: ArrayLike) -> Array:
+        """Transform points (..., 3) from frame B to frame A."""
+        result: Array = np.asarray(points_mm, dtype=np.float64) @ self.R.T + self.t_mm
+        return result
+
+    def inverse(self) -> Pose:
+        return Pose(self.R.T, -self.R.T @ self.t_mm)
+
+    def __matmul__(self, other: Pose) -> Pose:
+        return Pose(self.R @ other.R, self.R @ other.t_mm + self.t_mm)
+
+
+@dataclass(frozen=True, eq=False)
+class Reading(_Frozen):
+    """One tracker measurement of one target, in the station frame T.
+
+    `cov_mm2` (3, 3) is the instrument's covariance of this reading; `degraded` marks a usable reading whose
+    accuracy the instrument does not guarantee. `face` is 1 or 2 (two-face instruments).
+    """
+
+    target: str
+    p_T_mm: Array
+    cov_mm2: Array
+    t_s: float
+    face: int = 1
+    degraded: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Points(_Frozen):
+    """Named points in one frame: `xyz_mm` (n, 3) with `cov_mm2` (n, 3, 3).
+
+    A point measured in several passes appears in several rows with the same name; `passes` (n,) is the row's pass.
+    """
+
+    names: tuple[str, ...]
+    xyz_mm: Array
+    cov_mm2: Array
+    passes: tuple[int, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """A point left out of the fit: which, why (`reason` is a short stable word), and the numbers in `detail`."""
+
+    name: str
+    reason: str
+    detail: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Screened(_Frozen):
+    """Point pairs that passed the screening, one row a name.
+
+    `nominal_mm` (n, 3) in N, `measured_mm` (n, 3) in M (passes averaged), with covariances (n, 3, 3).
+    """
+
+    names: tuple[str, ...]
+    nominal_mm: Array
+    nominal_cov_mm2: Array
+    measured_mm: Array
+    measured_cov_mm2: Array
+    rejected: tuple[Rejection, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Fit(_Frozen):
+    """A fitted pose X_MN (nominal frame N into measured frame M) with its uncertainty.
+
+    `cov` (6, 6) is the covariance of the left perturbation [rotation_rad (3), translation_mm (3)] in M taken about
+    `pivot_mm` (3,) in M: a point p in M moves by `w x (p - pivot) + d`. `residuals_mm` (n, 3) = measured - fitted.
+    """
+
+    X_MN: Pose
+    cov: Array
+    pivot_mm: Array
+    names: tuple[str, ...]
+    residuals_mm: Array
+    rms_mm: float
+    max_mm: float
+    method: str
+    iterations: int
+    chi2: float
+    dof: int
+    rejected: tuple[Rejection, ...] = ()
+
+    def point_cov_mm2(self, p_M_mm: ArrayLike) -> Array:
+        """Covariance (n, 3, 3) that the pose uncertainty gives the points `p_M_mm` (n, 3)."""
+        arm = np.atleast_2d(np.asarray(p_M_mm, dtype=np.float64)) - self.pivot_mm
+        jac = np.zeros((len(arm), 3, 6))
+        x, y, z = arm.T
+        jac[:, 0, 1], jac[:, 0, 2] = z, -y
+        jac[:, 1, 0], jac[:, 1, 2] = -z, x
+        jac[:, 2, 0], jac[:, 2, 1] = y, -x
+        jac[:, :, 3:] = np.eye(3)
+        result: Array = jac @ self.cov @ jac.transpose(0, 2, 1)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureErrors(_Frozen):
+    """Docking features, component against mate, in W.
+
+    `error_mm` (n, 3) component minus mate; `sigma_mm` (n,) sqrt of the largest eigenvalue of that difference's
+    covariance (component fit, mate fit, drift, nominal, thermal); `tolerance_mm` (n,).
+    """
+
+    names: tuple[str, ...]
+    error_mm: Array
+    sigma_mm: Array
+    tolerance_mm: Array
+
+    @property
+    def norm_mm(self) -> Array:
+        result: Array = np.linalg.norm(self.error_mm, axis=1)
+        return result
+
+    def worst(self) -> int:
+        """Index of the feature with the largest e + 2 sigma (ISO 14253-1 decision rule, k = 2)."""
+        return int(np.argmax(self.norm_mm + 2.0 * self.sigma_mm))
+
+    def accepted(self) -> bool:
+        """True when every e + 2 sigma is inside its tolerance; NaN fails."""
+        return bool(np.all(self.norm_mm + 2.0 * self.sigma_mm <= self.tolerance_mm))
+
+
+@dataclass(frozen=True, eq=False)
+class Correction(_Frozen):
+    """A rigid displacement of the component in W about `pivot_W_mm`: rotate by `rotvec_rad`, shift by `shift_mm`."""
+
+    pivot_W_mm: Array
+    rotvec_rad: Array
+    shift_mm: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Plan(_Frozen):
+    """A checked move as a table: what the positioners do when the path is run at full rate.
+
+    `t_s` (n,) path time on an even grid of `period_s`; `q_mm` (n, m) axis positions in the order of `axes`
+    (driven and passive); `s` (n,) the scalar path coordinate 0..1. `plan_hash` identifies the content.
+    `duration_s` is t_s[-1]. All stops and holds change the rate at which path time runs, never the path.
+    """
+
+    plan_id: int
+    plan_hash: str
+    stage: str
+    kind: str
+    axes: tuple[str, ...]
+    period_s: float
+    t_s: Array
+    s: Array
+    q_mm: Array
+    correction: Correction
+    chord_error_mm: float
+    rate_slew_per_s: float
+    speed_limited_by: str
+    margins: tuple[tuple[str, float, float], ...] = ()
+
+    @property
+    def duration_s(self) -> float:
+        return float(self.t_s[-1])
+
+    @property
+    def displacement_mm(self) -> Array:
+        result: Array = self.q_mm[-1] - self.q_mm[0]
+        return result
+
+
+class AxisState(Enum):
+    """What a positioner axis reports of itself, whatever its bus."""
+
+    UNKNOWN = "unknown"
+    DISABLED = "disabled"
+    ENABLED = "enabled"
+    STOPPING = "stopping"
+    FAULT = "fault"
+
+
+@dataclass(frozen=True, eq=False)
+class Feedback:
+    """One read-back of all axes (order of the cell file). Not copied: made once a cycle by a driver.
+
+    `position_mm` (m,), `following_error_mm` (m,), `force_n` (m,) load on each axis along itself (NaN where no load
+    cell); `age_cycles` (m,) cycles since each axis last reported; `fraction_s` path time that a queue-playing device
+    reports (NaN where the host streams). `fault` is None or (axis, code, text) of the first axis in fault.
+    """
+
+    t_s: float
+    position_mm: Array
+    following_error_mm: Array
+    force_n: Array
+    states: tuple[AxisState, ...]
+    age_cycles: Array
+    path_time_s: float = float("nan")
+    fault: tuple[str, int, str] | None = None
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Who answered on a wire: `where` (tracker, axis A.X, positioner A) and what it says of itself."""
+
+    where: str
+    vendor: str
+    product: str
+    serial: str
+    firmware: str
+
+
+class MotionPhase(Enum):
+    """What the motion side is doing."""
+
+    OFF = "off"
+    HOLDING = "holding"
+    MOVING = "moving"
+    PAUSING = "pausing"
+    PAUSED = "paused"
+    STOPPING = "stopping"
+    STOPPED = "stopped"
+    FAULT = "fault"
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """A fault as a person sees it and as the journal keeps it."""
+
+    code: int
+    message: str
+    where: str = ""
+    value: float | str | None = None
+    limit: float | str | None = None
+    remedy: str = ""
+    t_s: float = field(default=float("nan"))
