@@ -18,7 +18,7 @@ from functools import cache
 from importlib import resources
 from typing import ClassVar
 
-from docking.types import Alarm
+from docking.types import Alarm, Rejection
 
 Quantity = float | int | str | None
 
@@ -153,7 +153,9 @@ class TickLate(MotionError):
 
 # 3xxx measuring and fitting --------------------------------------------------------------------------------------
 class PoseError(DockingError):
-    """Measuring and fitting."""
+    """Measuring and fitting. `rejected` holds what the screening had found out about single points when it refused."""
+
+    rejected: tuple[Rejection, ...] = ()
 
 
 class TooFewPoints(PoseError):
@@ -198,6 +200,10 @@ class MateMoved(PoseError):
 
 class UnitMixUp(PoseError):
     code = 3011
+
+
+class SigmaMissing(PoseError):
+    code = 3012
 
 
 # 4xxx files and arguments ----------------------------------------------------------------------------------------
@@ -272,6 +278,10 @@ class ToleranceUnprovable(PlanError):
     exit_code = EXIT_OUT_OF_TOLERANCE
 
 
+class PlanInputInvalid(PlanError):
+    code = 5010
+
+
 # 6xxx what may happen when ---------------------------------------------------------------------------------------
 class StateError(DockingError):
     """What may happen when."""
@@ -292,3 +302,11 @@ class StoppedByOperator(StateError):
 
 class JournalCorrupt(StateError):
     code = 6004
+
+
+class JournalBusy(StateError):
+    code = 6005
+
+
+class JournalUnwritable(StateError):
+    code = 6006

@@ -1,0 +1,105 @@
+"""From the files to what the stages take: positioner geometry and the settings of kinematics, planning and motion."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from docking.config.budget import docked_pose
+from docking.config.cell import CellFile, ModbusBus
+from docking.config.job import JobFile
+from docking.kinematics import Load, Positioners, RankSettings
+from docking.planning import ConvergenceSettings, GuardSettings, PlanSettings
+from docking.types import Array, readonly
+
+STANDARD_GRAVITY_M_S2 = 9.80665
+
+
+def positioners_from(cell: CellFile, job: JobFile) -> Positioners:
+    """The cell's positioners under the job's balls, in the order of the cell file.
+
+    The balls sit straight in their sockets in the docked attitude. The files must have passed their checks: a
+    positioner without a ball raises KeyError.
+    """
+    stations = cell.positioners
+    axes = [axis for station in stations for axis in station.axes]
+    balls = {ball.positioner: ball.xyz_mm for ball in job.component.balls}
+    part = job.component
+    grown = 1.0 + part.expansion_per_k * (part.temperature_c - cell.temperature_c)
+    return Positioners(
+        names=tuple(station.name for station in stations),
+        axes=cell.axis_names,
+        origins_W_mm=np.array([station.origin_mm for station in stations]),
+        axes_W=np.array([np.transpose([axis.direction for axis in station.axes]) for station in stations]),
+        driven=np.array(cell.driven),
+        stroke_mm=np.array([axis.stroke_mm for axis in axes]),
+        v_mm_s=np.array([axis.v_mm_s for axis in axes]),
+        a_mm_s2=np.array([axis.a_mm_s2 for axis in axes]),
+        j_mm_s3=np.array([axis.j_mm_s3 for axis in axes]),
+        a_quick_mm_s2=np.array([axis.a_quick_mm_s2 for axis in axes]),
+        stiffness_n_per_mm=np.array([station.stiffness_n_per_mm for station in stations]),
+        rated_n=np.array([station.rated_n for station in stations]),
+        swivel_rad=np.radians([station.swivel_deg for station in stations]),
+        balls_C_mm=np.array([balls[station.name] for station in stations]) * grown,
+        neutral_R_WC=docked_pose(cell, job).R,
+    )
+
+
+def gravity_m_s2(cell: CellFile) -> Array:
+    """Gravity (3,) in W."""
+    direction = np.array(cell.gravity_direction)
+    return readonly(STANDARD_GRAVITY_M_S2 * direction / np.linalg.norm(direction))
+
+
+def load_from(cell: CellFile, job: JobFile) -> Load:
+    """What the positioners carry."""
+    part = job.component
+    return Load(
+        mass_kg=part.mass_kg,
+        mass_tolerance_kg=part.mass_tolerance_kg,
+        com_C_mm=readonly(part.com_mm),
+        com_tolerance_mm=readonly(part.com_tolerance_mm),
+        gravity_m_s2=gravity_m_s2(cell),
+    )
+
+
+def rank_settings(cell: CellFile) -> RankSettings:
+    """Limits of the check that the driven axes hold the component."""
+    return RankSettings(rotation_length_mm=cell.limits.rotation_length_mm, condition_max=cell.limits.condition_max)
+
+
+def guard_settings(cell: CellFile) -> GuardSettings:
+    """Limits of the correction guard."""
+    limits = cell.limits
+    return GuardSettings(
+        first_mm=limits.first_correction_mm,
+        first_rad=float(np.radians(limits.first_correction_deg)),
+        station_min_mm=limits.station_correction_min_mm,
+        station_max_mm=limits.station_correction_max_mm,
+        station_gap_fraction=limits.station_correction_gap_fraction,
+        lever_mm=limits.rotation_length_mm,
+    )
+
+
+def convergence_settings(cell: CellFile, job: JobFile) -> ConvergenceSettings:
+    """Limits of the convergence loop at one station."""
+    return ConvergenceSettings(max_corrections=cell.limits.max_corrections, max_passes=job.measuring.max_passes)
+
+
+def plan_settings(cell: CellFile, job: JobFile) -> PlanSettings:
+    """Settings of the planner. Axes on a common SYNC start together; positioner PLCs run on their own clocks."""
+    limits, bus = cell.limits, cell.bus
+    return PlanSettings(
+        load=load_from(cell, job),
+        stroke_margin_mm=limits.stroke_margin_mm,
+        reaction_min_fraction=limits.reaction_min_fraction,
+        chord_error_mm=limits.chord_error_mm,
+        sync_error_mm=limits.ball_residual_warn_mm,
+        start_skew_s=bus.start_skew_s if isinstance(bus, ModbusBus) else 0.0,
+        clock_ppm=bus.clock_ppm if isinstance(bus, ModbusBus) else 0.0,
+        playback_ramp_s=bus.ramp_s if isinstance(bus, ModbusBus) else 0.0,
+    )
+
+
+def plan_period_s(cell: CellFile) -> float:
+    """Time between two rows of a plan: the bus cycle, or the segment of the positioners' queues."""
+    return cell.bus.segment_s if isinstance(cell.bus, ModbusBus) else cell.bus.cycle_s

@@ -1,0 +1,54 @@
+"""Pose of the component <-> ball centres <-> axis displacements; consistency and forces. Domain 4."""
+
+from docking.kinematics.forces import (
+    Load,
+    Reactions,
+    axis_forces_n,
+    ball_reactions_n,
+    consistency_projector,
+    internal_force_matrix,
+    internal_forces_n,
+    reaction_extremes,
+    sink_mm,
+    warp_rows,
+)
+from docking.kinematics.forward import figure_residual_mm, pairwise_residual_mm, pose_from_axes
+from docking.kinematics.monitor import CouplingMonitor, coupling_monitor
+from docking.kinematics.positioners import (
+    Conditioning,
+    Positioners,
+    RankSettings,
+    axis_displacements,
+    axis_jacobian,
+    axis_positions,
+    ball_jacobian,
+    conditioning,
+    socket_positions,
+)
+
+__all__ = [
+    "Conditioning",
+    "CouplingMonitor",
+    "Load",
+    "Positioners",
+    "RankSettings",
+    "Reactions",
+    "axis_displacements",
+    "axis_forces_n",
+    "axis_jacobian",
+    "axis_positions",
+    "ball_jacobian",
+    "ball_reactions_n",
+    "conditioning",
+    "consistency_projector",
+    "coupling_monitor",
+    "figure_residual_mm",
+    "internal_force_matrix",
+    "internal_forces_n",
+    "pairwise_residual_mm",
+    "pose_from_axes",
+    "reaction_extremes",
+    "sink_mm",
+    "socket_positions",
+    "warp_rows",
+]

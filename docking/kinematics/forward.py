@@ -1,0 +1,61 @@
+"""From axis positions to the pose of the component, and what fits no rigid body. Domain 4, equations (8), (9)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from docking.errors import FrameImplausible
+from docking.geometry import exp_so3
+from docking.kinematics.positioners import Positioners, axis_displacements, axis_jacobian, socket_positions
+from docking.types import Array, Pose
+
+_STEP_MM = 1e-9
+_ITERATIONS = 30
+
+
+def pose_from_axes(positioners: Positioners, q_mm: ArrayLike, rows: NDArray[np.bool_] | None = None) -> Pose:
+    """X_WC from axis positions `q_mm` (m,): least squares over the axes in the mask `rows` (m,), all by default.
+
+    With six independent rows it is the exact Newton solution; with more it is the rigid fit of the balls to the
+    sockets, weighted along the axes. Raises FrameImplausible when the iteration does not settle or the rows do not
+    fix a pose.
+    """
+    used = np.ones(len(positioners.axes), dtype=np.bool_) if rows is None else rows
+    sockets = socket_positions(positioners, q_mm)
+    R = positioners.neutral_R_WC
+    t = sockets.mean(axis=0) - R @ positioners.balls_C_mm.mean(axis=0)
+    length = float(np.sqrt(np.mean(np.sum(positioners.balls_C_mm**2, axis=1)))) or 1.0
+    step = np.full(6, np.inf)
+    for _ in range(_ITERATIONS):
+        balls = positioners.balls_C_mm @ R.T + t
+        jac = axis_jacobian(positioners, balls, t)[used]
+        jac[:, 3:] /= length
+        gap = axis_displacements(positioners, sockets - balls)[used]
+        step, _, rank, _ = np.linalg.lstsq(jac, gap, rcond=1e-9)
+        if rank < 6 or not np.all(np.isfinite(step)):
+            break
+        t = t + step[:3]
+        R = exp_so3(step[3:] / length) @ R
+        if np.max(np.abs(step)) <= _STEP_MM:
+            return Pose(R, t)
+    worst = float(np.max(np.abs(step)))
+    raise FrameImplausible("axis positions", "They fit no pose of the component.", value=worst, limit=_STEP_MM)
+
+
+def figure_residual_mm(positioners: Positioners, q_mm: ArrayLike, X_WC: Pose) -> Array:
+    """Socket less ball, e_i = o_i + A_i q_i - X_WC b_i (k, 3); equation (9)."""
+    result: Array = socket_positions(positioners, q_mm) - X_WC.apply(positioners.balls_C_mm)
+    return result
+
+
+def pairwise_residual_mm(sockets_W_mm: ArrayLike, balls_mm: ArrayLike) -> Array:
+    """| p_i - p_j | - | b_i - b_j | (..., k, k) of a socket figure (..., k, 3) against the ball figure (k, 3)."""
+
+    def distances(points: Array) -> Array:
+        result: Array = np.linalg.norm(points[..., :, None, :] - points[..., None, :, :], axis=-1)
+        return result
+
+    figure, balls = np.asarray(sockets_W_mm, dtype=np.float64), np.asarray(balls_mm, dtype=np.float64)
+    gap: Array = distances(figure) - distances(balls)
+    return gap

@@ -1,0 +1,144 @@
+"""How fast one rigid path may be run: the shortest time law inside all limits. Domain 5.2-5.4.
+
+Along the path `q' = g s'`, `q'' = g s'' + h s'^2`, `q''' = g s''' + 3 h s' s'' + l s'^3`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import ceil, sqrt
+
+import numpy as np
+
+from docking.errors import AxisLimitExceeded
+from docking.kinematics import Positioners
+from docking.planning.path import RigidPath
+from docking.planning.settings import PlanSettings
+from docking.planning.time_law import TimeLaw, quintic, s_curve
+from docking.types import Array
+
+_SAMPLES = 256
+_GUARD = 1.0002
+"""Stretch that covers what peaks between two samples of the law."""
+_LEAST_PERIODS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A law on a path at samples in time: |q'|, |q''|, |q'''| (n, m), peak speed of sockets and pivot, peak ds/dt."""
+
+    speed: Array
+    acceleration: Array
+    jerk: Array
+    point_speed: float
+    rate: float
+
+
+def motion_along(path: RigidPath, law: TimeLaw) -> Motion:
+    """Axis speeds, accelerations and jerks of `law` on `path`."""
+    s, ds, dds, ddds = law.samples(_SAMPLES)
+    g, h, third = (path.axis_derivative(s, order) for order in (1, 2, 3))
+    d1, d2, d3 = ds[:, None], dds[:, None], ddds[:, None]
+    return Motion(
+        np.abs(g * d1),
+        np.abs(g * d2 + h * d1**2),
+        np.abs(g * d3 + 3.0 * h * d1 * d2 + third * d1**3),
+        float(np.max(path.point_speed_mm(s) * d1)),
+        float(np.max(ds)),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class PaceLimits:
+    """What bounds one move: the axes, the stage's speed of the fastest ball or the pivot, the bus's period, settings.
+
+    `linear`: the devices interpolate each axis linearly over a period, so the chord error binds.
+    """
+
+    positioners: Positioners
+    speed_mm_s: float
+    period_s: float
+    linear: bool
+    settings: PlanSettings
+
+    def stretches(self, path: RigidPath, law: TimeLaw) -> list[tuple[float, str]]:
+        """(factor, limit) by which `law` must be stretched (shrunk below 1) to just meet each limit."""
+        motion = motion_along(path, law)
+        axes, share = self.positioners, self.settings.acceleration_share
+        ratios = {
+            "speed": motion.speed.max(axis=0) / axes.v_mm_s,
+            "acceleration": np.sqrt(motion.acceleration.max(axis=0) / (share * axes.a_mm_s2)),
+            "jerk": np.cbrt(motion.jerk.max(axis=0) / axes.j_mm_s3),
+        }
+        if self.settings.playback_ramp_s > 0.0:
+            ratios["stopping"] = self._stopping(motion)
+        found = [(float(r.max()), f"{axes.axes[int(r.argmax())]} {what}") for what, r in ratios.items()]
+        found.append((motion.point_speed / self.speed_mm_s, "stage speed"))
+        if self.linear:
+            found.append((self._chord(path, motion), "chord error of the interpolation"))
+        found.append((self._skew(motion, law), "start skew and clock drift of the bus"))
+        return found
+
+    def _stopping(self, motion: Motion) -> Array:
+        """Stretch x per axis with |q''| / x^2 + |q'| / (ramp x) <= a: the devices' ramp adds |q'| / ramp."""
+        limit = self.positioners.a_mm_s2
+        ramp = motion.speed / self.settings.playback_ramp_s
+        root: Array = (ramp + np.sqrt(ramp**2 + 4.0 * motion.acceleration * limit)) / (2.0 * limit)
+        worst: Array = root.max(axis=0)
+        return worst
+
+    def _chord(self, path: RigidPath, motion: Motion) -> float:
+        """Rotation per period over the largest that keeps L theta^2 / 8 inside the chord error."""
+        largest = sqrt(8.0 * self.settings.chord_error_mm / path.spread_mm) if path.spread_mm > 0.0 else float("inf")
+        return path.angle_rad * motion.rate * self.period_s / largest
+
+    def _skew(self, motion: Motion, law: TimeLaw) -> float:
+        """v (skew + 2 ppm T) <= delta. Stretching leaves v T as it is, so drift takes a fixed part of delta."""
+        drift = motion.point_speed * law.duration_s * 2e-6 * self.settings.clock_ppm
+        left = self.settings.sync_error_mm - drift
+        if not left > 0.0:
+            cause = "Clock drift over the move in mm; divide the move or raise the clocks' quality."
+            raise AxisLimitExceeded("bus", cause, value=drift, limit=self.settings.sync_error_mm)
+        return motion.point_speed * self.settings.start_skew_s / left
+
+
+def fastest_law(path: RigidPath, limits: PaceLimits) -> tuple[TimeLaw, str]:
+    """The shorter of quintic and seven-segment law within all limits, its duration a multiple of the period.
+
+    Returns the law and the name of the limit that sets its duration.
+    """
+    if path.travel_mm <= 0.0:
+        return quintic(_LEAST_PERIODS * limits.period_s), "standstill"
+    best, reason = quintic(), ""
+    for number, law in enumerate((quintic(), _s_curve_for(path, limits))):
+        factor, name = max(limits.stretches(path, law))
+        duration = law.duration_s * factor * _GUARD
+        if number == 0 or duration < best.duration_s:
+            best, reason = law.stretched_to(duration), name
+    periods = max(_LEAST_PERIODS, ceil(best.duration_s / limits.period_s - 1e-9))
+    if periods == _LEAST_PERIODS:
+        reason = "period of the bus"
+    return best.stretched_to(periods * limits.period_s), reason
+
+
+def _s_curve_for(path: RigidPath, limits: PaceLimits) -> TimeLaw:
+    """Seven-segment law whose shape suits the limits projected on s; its exact duration follows from its stretches."""
+    axes, share = limits.positioners, limits.settings.acceleration_share
+    g, h = (np.maximum(path.axis_bounds(order), 1e-12) for order in (1, 2))
+    samples = path.point_speed_mm(np.linspace(0.0, 1.0, 17))
+    usable = share * axes.a_mm_s2
+    turning = np.sqrt(0.25 * usable / h)
+    v = min(float(np.min(axes.v_mm_s / g)), limits.speed_mm_s / float(samples.max()), float(np.min(turning)))
+    a = float(np.min((usable - h * v**2) / g))
+    if limits.settings.playback_ramp_s > 0.0:
+        v = min(v, limits.settings.playback_ramp_s * float(np.min((axes.a_mm_s2 - usable) / g)))
+    return s_curve(v, a, float(np.min(axes.j_mm_s3 / g)))
+
+
+def rate_slew_per_s(path: RigidPath, law: TimeLaw, limits: PaceLimits) -> float:
+    """Largest |d rate / dt| of the playback rate that keeps |q''| + |q'| rate' inside every axis's acceleration."""
+    if limits.settings.playback_ramp_s > 0.0:
+        return 1.0 / limits.settings.playback_ramp_s
+    motion = motion_along(path, law)
+    spare = (limits.positioners.a_mm_s2 - motion.acceleration) / np.maximum(motion.speed, 1e-9)
+    return min(float(spare.min()), limits.settings.rate_slew_max_per_s)

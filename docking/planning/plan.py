@@ -1,0 +1,98 @@
+"""From a correction to a checked table of axis positions: path, time law, pre-flight."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from docking.errors import PlanInputInvalid
+from docking.kinematics import Positioners, pose_from_axes
+from docking.planning.pace import PaceLimits, fastest_law, rate_slew_per_s
+from docking.planning.path import rigid_path
+from docking.planning.preflight import check_attitudes, check_chord, check_strokes, check_table
+from docking.planning.settings import PlanSettings
+from docking.types import Array, Correction, Plan
+
+
+@dataclass(frozen=True, eq=False)
+class PlanRequest:
+    """One move to plan: `q_now_mm` (m,) commanded axis positions (read-back for passive axes), `correction` in W,
+    `speed_mm_s` of the fastest ball or the pivot, `period_s` between two rows (bus cycle or segment);
+    `linear_interpolation`: the devices interpolate each axis linearly between rows, so the chord error binds."""
+
+    plan_id: int
+    stage: str
+    kind: str
+    q_now_mm: Array
+    correction: Correction
+    speed_mm_s: float
+    period_s: float
+    linear_interpolation: bool
+
+
+def make_plan(request: PlanRequest, positioners: Positioners, settings: PlanSettings) -> Plan:
+    """Plan and check the whole move. Raises PlanInputInvalid, StrokeExceeded, AxisLimitExceeded, BallReactionOut,
+    BallSwivelExceeded; FrameImplausible when the axis positions fit no pose."""
+    _check_request(request, positioners)
+    path = rigid_path(positioners, request.q_now_mm, request.correction)
+    room = check_strokes(path, positioners, settings)
+    check_attitudes(pose_from_axes(positioners, request.q_now_mm), request.correction, positioners, settings)
+    limits = PaceLimits(positioners, request.speed_mm_s, request.period_s, request.linear_interpolation, settings)
+    law, limited_by = fastest_law(path, limits)
+    t_s = request.period_s * np.arange(round(law.duration_s / request.period_s) + 1, dtype=np.float64)
+    s = law.at(t_s)
+    q = path.axes_mm(s)
+    peak = check_table(s, q, request.period_s, positioners)
+    chord = check_chord(path, s, settings.chord_error_mm) if request.linear_interpolation else 0.0
+    margins = tuple((axis, float(room[k]), float(peak[k])) for k, axis in enumerate(positioners.axes))
+    return Plan(
+        plan_id=request.plan_id,
+        plan_hash=_content_hash(request, positioners.axes, s, q),
+        stage=request.stage,
+        kind=request.kind,
+        axes=positioners.axes,
+        period_s=request.period_s,
+        t_s=t_s,
+        s=s,
+        q_mm=q,
+        correction=request.correction,
+        chord_error_mm=chord,
+        rate_slew_per_s=rate_slew_per_s(path, law, limits),
+        speed_limited_by=limited_by,
+        margins=margins,
+    )
+
+
+def _check_request(request: PlanRequest, positioners: Positioners) -> None:
+    """NaN, infinity, a wrong length or a speed that is not positive never reach the path."""
+    for name in ("speed_mm_s", "period_s"):
+        value = getattr(request, name)
+        if not 0.0 < value < float("inf"):
+            raise PlanInputInvalid(name, value=value, limit="positive and finite")
+    if request.q_now_mm.shape != (len(positioners.axes),):
+        limit = f"one number for each of {len(positioners.axes)} axes"
+        raise PlanInputInvalid("axis positions", value=str(request.q_now_mm.shape), limit=limit)
+    correction = request.correction
+    for where, array in (
+        ("axis positions", request.q_now_mm),
+        ("pivot", correction.pivot_W_mm),
+        ("rotation", correction.rotvec_rad),
+        ("shift", correction.shift_mm),
+    ):
+        if not np.all(np.isfinite(array)):
+            raise PlanInputInvalid(where, value=str(array), limit="finite")
+    if not float(np.linalg.norm(correction.rotvec_rad)) <= np.pi:
+        raise PlanInputInvalid("rotation", value=float(np.linalg.norm(correction.rotvec_rad)), limit="at most pi rad")
+
+
+def _content_hash(request: PlanRequest, axes: tuple[str, ...], s: Array, q_mm: Array) -> str:
+    """SHA-256 over everything that decides what the axes will do."""
+    digest = hashlib.sha256()
+    words = (str(request.plan_id), request.stage, request.kind, repr(request.period_s), *axes)
+    digest.update("\x1f".join(words).encode())
+    correction = request.correction
+    for array in (correction.pivot_W_mm, correction.rotvec_rad, correction.shift_mm, s, q_mm):
+        digest.update(np.ascontiguousarray(array, dtype="<f8").data)
+    return digest.hexdigest()
