@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from docking.types import Array, Feedback, Identity, Plan, Reading
+from docking.types import Array, Feedback, Identity, MoveResult, Plan, Reading
 
 
 class Tracker(Protocol):
@@ -82,6 +82,38 @@ class QueuedPositioners(Protocol):
     async def close(self) -> None: ...
 
 
+class Motion(Protocol):
+    """All the cell knows of motion: load a table, start it, hold, resume or stop on the path, see where it stands."""
+
+    axes: tuple[str, ...]
+
+    async def connect(self) -> tuple[Identity, ...]:
+        """Prove every positioner: identity, settings, watchdogs."""
+        ...
+
+    async def enable(self) -> Array:
+        """Enable the driven axes as one group; return the commanded positions (m,), equal to where the axes stand."""
+        ...
+
+    async def load(self, plan: Plan) -> None:
+        """Take a plan; refused when it does not start where the axes are commanded (PlanStale). Nothing moves."""
+        ...
+
+    async def start(self, plan_hash: str) -> MoveResult:
+        """Run the loaded plan to its end, or to standstill after a stop or a fault."""
+        ...
+
+    def request(self, verb: str) -> None:
+        """`hold`, `resume` or `stop`, all on the path. Never waits."""
+        ...
+
+    def feedback(self) -> Feedback:
+        """The newest read-back."""
+        ...
+
+    async def close(self) -> None: ...
+
+
 class Journal(Protocol):
     """Write-ahead record of everything that happens; `write` returns after the record is durable when `durable`."""
 
@@ -95,6 +127,10 @@ class Operator(Protocol):
 
     async def confirm(self, plan: Plan, shown: dict[str, Any]) -> bool:
         """Show the deviation and every axis displacement; True = go, False = abort."""
+        ...
+
+    async def permissives(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        """Ask for the named inputs; return those that are not given."""
         ...
 
     def notify(self, text: str) -> None:

@@ -117,6 +117,7 @@ class Screened(_Frozen):
     """Point pairs that passed the screening, one row a name.
 
     `nominal_mm` (n, 3) in N, `measured_mm` (n, 3) in M (passes averaged), with covariances (n, 3, 3).
+    `rejected` are whole points; `dropped` are single readings left out of a point that is still used.
     """
 
     names: tuple[str, ...]
@@ -125,6 +126,7 @@ class Screened(_Frozen):
     measured_mm: Array
     measured_cov_mm2: Array
     rejected: tuple[Rejection, ...] = ()
+    dropped: tuple[Rejection, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +135,8 @@ class Fit(_Frozen):
 
     `cov` (6, 6) is the covariance of the left perturbation [rotation_rad (3), translation_mm (3)] in M taken about
     `pivot_mm` (3,) in M: a point p in M moves by `w x (p - pivot) + d`. `residuals_mm` (n, 3) = measured - fitted.
+    `expansion` is the fitted uniform expansion of the body about the pivot (0 = rigid fit); `expansion_cov` (7,) is
+    its covariance with the six pose parameters and its variance, None where it was not estimated.
     """
 
     X_MN: Pose
@@ -147,9 +151,17 @@ class Fit(_Frozen):
     chi2: float
     dof: int
     rejected: tuple[Rejection, ...] = ()
+    expansion: float = 0.0
+    expansion_cov: Array | None = None
+
+    def predict(self, p_N_mm: ArrayLike) -> Array:
+        """Where the points `p_N_mm` (..., 3) of the fitted body are in M, its expansion about the pivot included."""
+        q = self.X_MN.apply(p_N_mm)
+        result: Array = q + self.expansion * (q - self.pivot_mm)
+        return result
 
     def point_cov_mm2(self, p_M_mm: ArrayLike) -> Array:
-        """Covariance (n, 3, 3) that the pose uncertainty gives the points `p_M_mm` (n, 3)."""
+        """Covariance (n, 3, 3) that the uncertainty of pose and expansion gives the points `p_M_mm` (n, 3)."""
         arm = np.atleast_2d(np.asarray(p_M_mm, dtype=np.float64)) - self.pivot_mm
         jac = np.zeros((len(arm), 3, 6))
         x, y, z = arm.T
@@ -158,6 +170,9 @@ class Fit(_Frozen):
         jac[:, 2, 0], jac[:, 2, 1] = y, -x
         jac[:, :, 3:] = np.eye(3)
         result: Array = jac @ self.cov @ jac.transpose(0, 2, 1)
+        if self.expansion_cov is not None:
+            cross = (jac @ self.expansion_cov[:6])[:, :, None] * arm[:, None, :]
+            result += cross + cross.transpose(0, 2, 1) + self.expansion_cov[6] * arm[:, :, None] * arm[:, None, :]
         return result
 
 
@@ -271,17 +286,35 @@ class Identity:
     firmware: str
 
 
-class MotionPhase(Enum):
-    """What the motion side is doing."""
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """What was recorded during a move, one row a recorded cycle (n): times, positions and following errors (n, m),
+    consistency residual (n,), predicted internal force (n,), measured force along each axis (n, m; NaN = none)."""
 
-    OFF = "off"
-    HOLDING = "holding"
-    MOVING = "moving"
-    PAUSING = "pausing"
-    PAUSED = "paused"
-    STOPPING = "stopping"
-    STOPPED = "stopped"
-    FAULT = "fault"
+    t_s: Array
+    path_time_s: Array
+    position_mm: Array
+    following_error_mm: Array
+    residual_mm: Array
+    internal_force_n: Array
+    force_n: Array
+
+
+@dataclass(frozen=True, eq=False)
+class MoveResult:
+    """How a move ended: `done`, `stopped` (on request, on the path) or `fault` (with the cause in `alarm`).
+
+    `path_time_s` is where on the plan it ended, `commanded_mm` (m,) the last commanded axis positions.
+    """
+
+    result: str
+    path_time_s: float
+    commanded_mm: Array
+    trace: Trace
+    max_following_error_mm: Array
+    max_residual_mm: float
+    max_internal_force_n: float
+    alarm: Alarm | None = None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,44 @@
+# Two commands on a fresh machine: `make dock` and `make test`. Each installs what it needs into .venv first.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+CELL ?= sim/cells/fuselage-can.toml
+RUNS ?= runs
+SEEDS ?= 100
+
+.PHONY: dock test lint bench study wires clean
+
+dock: $(VENV)/.installed
+	@mkdir -p $(RUNS)
+	$(BIN)/docking dry-run $(CELL) --report $(RUNS)/report.html
+	@echo "Report: $(RUNS)/report.html"
+
+test: $(VENV)/.installed-dev lint
+	$(BIN)/pytest -n 2 --dist loadgroup
+
+lint: $(VENV)/.installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(VENV)/.installed-dev
+	$(BIN)/python -m tests.bench
+
+study: $(VENV)/.installed-dev
+	$(BIN)/docking study dock --seeds $(SEEDS)
+
+wires: $(VENV)/.installed-dev
+	$(BIN)/pytest -m wires tests/e2e --all-cells
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[report]'
+	@touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) $(RUNS) build *.egg-info

@@ -1,0 +1,306 @@
+"""The command line: `docking COMMAND`. With `--json` exactly one object goes to stdout on every exit."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from docking.errors import (
+    EXIT_FAULT,
+    EXIT_OK,
+    EXIT_OUT_OF_TOLERANCE,
+    EXIT_STOPPED,
+    BadArgument,
+    ConfigInvalid,
+    DockingError,
+    StoppedByOperator,
+)
+
+EXIT_OF_OUTCOME = {
+    "docked": EXIT_OK,
+    "out_of_tolerance": EXIT_OUT_OF_TOLERANCE,
+    "stopped": EXIT_STOPPED,
+    "fault": EXIT_FAULT,
+    "refused": EXIT_FAULT,
+}
+FILE = click.Path(path_type=Path)
+
+
+def language() -> str:
+    """`zh` when DOCKING_LANGUAGE (or the locale) asks for it, else `en`."""
+    asked = os.environ.get("DOCKING_LANGUAGE") or os.environ.get("LC_ALL") or os.environ.get("LANG") or "en"
+    return "zh" if asked.lower().startswith("zh") else "en"
+
+
+def _json_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    return click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout and nothing else.")(
+        command
+    )
+
+
+def _print_json(body: dict[str, Any]) -> None:
+    click.echo(json.dumps(body, ensure_ascii=False, allow_nan=False))
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="docking-cell", prog_name="docking")
+def cli() -> None:
+    """Docks large aircraft components with numerically controlled positioners.
+
+    A functional layer, not a safety function: the emergency-stop chain is hard-wired and does not depend on it.
+
+    \b
+    Example: docking dry-run sim/cells/lab-can.toml --report report.html
+    """
+
+
+@cli.command()
+@click.argument("cell", type=FILE)
+@click.argument("job", type=FILE, required=False)
+@_json_option
+def check(cell: Path, job: Path | None, as_json: bool) -> int:
+    """Check a CELL file and its JOB file, and say what the cell can prove.
+
+    \b
+    Example: docking check sim/cells/fuselage-can.toml
+    """
+    from docking.config.check import check_files
+
+    result = check_files(cell, job)
+    if as_json:
+        _print_json(result.as_json())
+    else:
+        click.echo(result.text)
+    return EXIT_OK
+
+
+@cli.command("dry-run")
+@click.argument("cell", type=FILE)
+@click.argument("job", type=FILE, required=False)
+@click.option("--seed", default=1, show_default=True, help="Seed of the simulated errors.")
+@click.option("--report", type=FILE, help="Write the report to this HTML file.")
+@click.option(
+    "--journal", type=FILE, help="Keep the journal in this file (default: beside the report, else temporary)."
+)
+@_json_option
+def dry_run(cell: Path, job: Path | None, seed: int, report: Path | None, journal: Path | None, as_json: bool) -> int:
+    """Dock against simulated devices in virtual time: real state machine, real drivers, real bytes.
+
+    \b
+    Example: docking dry-run sim/cells/fuselage-can.toml --seed 7 --report report.html
+    """
+    from docking import assemble
+
+    say = _say(as_json)
+    summary = assemble.dry_run(assemble.RunRequest(cell, job, seed, report, journal, language()), say)
+    return _ended(summary, as_json)
+
+
+@cli.command()
+@click.argument("cell", type=FILE)
+@click.argument("job", type=FILE, required=False)
+@click.option("--sim", is_flag=True, help="Use simulated devices on real wires.")
+@click.option("--wires", type=FILE, help="Addresses that `docking sim` wrote; without it --sim starts its own devices.")
+@click.option("--step", is_flag=True, help="Ask before every move; h holds, r resumes, a aborts.")
+@click.option("--seed", default=1, show_default=True, help="Seed of the simulated errors (with --sim).")
+@click.option("--report", type=FILE, help="Write the report to this HTML file.")
+@click.option(
+    "--journal", type=FILE, help="Keep the journal in this file (default: beside the report, else temporary)."
+)
+@_json_option
+def run(as_json: bool, step: bool, sim: bool, wires: Path | None, **request: Any) -> int:
+    """Dock over real wires, to real devices or (--sim) simulated ones.
+
+    \b
+    Example: docking run sim/cells/lab-can.toml --sim --step
+    """
+    from docking import assemble
+
+    if wires is not None and not sim:
+        raise BadArgument("--wires", "addresses of simulated devices need --sim", value=str(wires))
+    if not step and not sim:
+        raise BadArgument("run", "real devices are docked step by step; add --step", value="unattended motion")
+    wanted = assemble.RunRequest(
+        request["cell"], request["job"], request["seed"], request["report"], request["journal"], language()
+    )
+    summary = assemble.run_on_wires(wanted, assemble.WireChoice(sim, wires), _say(as_json), step=step)
+    return _ended(summary, as_json)
+
+
+@cli.command()
+@click.argument("cell", type=FILE)
+@click.argument("job", type=FILE, required=False)
+@click.option("--seed", default=1, show_default=True, help="Seed of the simulated errors.")
+@click.option("--wires", type=FILE, help="Write the addresses of the wires to this JSON file.")
+def sim(cell: Path, job: Path | None, seed: int, wires: Path | None) -> int:
+    """Serve the simulated devices of a cell on real wires until interrupted.
+
+    \b
+    Example: docking sim sim/cells/lab-can.toml --wires wires.json
+    """
+    from docking import assemble
+
+    assemble.serve(assemble.RunRequest(cell, job, seed, None, None, language()), wires, _say(False))
+    return EXIT_OK
+
+
+@cli.command()
+@click.argument("nominal", type=FILE)
+@click.argument("measured", type=FILE)
+@click.option(
+    "--method", type=click.Choice(["svd", "three-point", "least-squares"]), default="least-squares", show_default=True
+)
+@_json_option
+def fit(nominal: Path, measured: Path, method: str, as_json: bool) -> int:
+    """Fit the pose that takes NOMINAL points into MEASURED coordinates (CSV files).
+
+    \b
+    Header: name,x_mm,y_mm,z_mm[,sx_mm,sy_mm,sz_mm]; passes of a point are rows with the same name.
+    Example: docking fit nominal.csv measured.csv --method svd --json
+    """
+    from docking.fit_report import fit_files, fit_text
+
+    result = fit_files(nominal, measured, method)
+    if as_json:
+        _print_json(result)
+    else:
+        click.echo(fit_text(result))
+    return EXIT_FAULT if result["refused"] else EXIT_OK
+
+
+@cli.group()
+def study() -> None:
+    """Long studies over many seeds; resumable, on all cores.
+
+    \b
+    Example: docking study dock sim/cells/lab-can.toml --seeds 100
+    """
+
+
+@study.command("dock")
+@click.argument("cells", type=FILE, nargs=-1)
+@click.option("--seeds", default=100, show_default=True, help="How many seeds a cell.")
+@click.option(
+    "--out", type=FILE, default=Path("studies"), show_default=True, help="Where results are kept and resumed."
+)
+@click.option("--workers", type=int, help="Processes (default: one a core).")
+@click.option(
+    "--stress", is_flag=True, help="Stress study: all unmodelled errors at stress size, false acceptance counted."
+)
+@click.option("--tolerance-mm", type=float, help="With --stress: the tolerance of every feature.")
+@click.option("--error", "errors", multiple=True, help="NAME=SCALE of one unmodelled error; others stay as they are.")
+@_json_option
+def study_dock(cells: tuple[Path, ...], as_json: bool, **options: Any) -> int:
+    """Dock every reference cell (or CELLS) with many seeds and count the outcomes.
+
+    \b
+    Example: docking study dock sim/cells/lab-can.toml --seeds 100
+    """
+    from docking.study import StudyRequest, study_dock, study_text
+
+    result = study_dock(StudyRequest(cells=cells, **options), _say(as_json))
+    if as_json:
+        _print_json(result)
+    else:
+        click.echo(study_text(result))
+    return EXIT_OK
+
+
+def _say(as_json: bool) -> Callable[[str], None]:
+    """Where progress goes: stdout for a person, stderr when stdout carries JSON."""
+    return lambda text: click.echo(text, err=as_json)
+
+
+def _ended(summary: dict[str, Any], as_json: bool) -> int:
+    if as_json:
+        _print_json(summary)
+    else:
+        click.echo(_summary_text(summary))
+    return EXIT_OF_OUTCOME[summary["outcome"]]
+
+
+def _summary_text(summary: dict[str, Any]) -> str:
+    words = {"en": _ENGLISH, "zh": _CHINESE}[language()]
+    lines = [words[summary["outcome"]]]
+    if summary["max_feature_error_mm"] is not None:
+        lines.append(words["features"].format(**summary))
+    if summary["true_max_feature_error_mm"] is not None:
+        lines.append(words["truth"].format(**summary))
+    if summary["virtual_time_s"] is not None:
+        lines.append(words["moves"].format(**summary))
+    lines += [f"{a['code']}: {a['message']}\n    -> {a['remedy']}" for a in summary["alarms"]]
+    return "\n".join(lines)
+
+
+_ENGLISH = {
+    "docked": "DOCKED: every docking feature is inside its tolerance with its uncertainty.",
+    "out_of_tolerance": "OUT OF TOLERANCE: at least one docking feature cannot be proved inside its tolerance.",
+    "stopped": "STOPPED by the operator. Measure again before moving on.",
+    "fault": "FAULT: motion stopped.",
+    "refused": "REFUSED: nothing was started.",
+    "features": "largest feature deviation {max_feature_error_mm:.3f} mm, sigma {feature_sigma_mm:.3f} mm, "
+    "tolerance {tolerance_mm:.3f} mm",
+    "truth": "true largest deviation (simulation only) {true_max_feature_error_mm:.3f} mm",
+    "moves": "{moves} moves in {virtual_time_s:.0f} s of cell time, computed in {wall_time_s:.1f} s",
+}
+_CHINESE = {
+    "docked": "对接完成:所有对接特征连同不确定度均在公差内。",
+    "out_of_tolerance": "超差:至少一个对接特征无法证明在公差内。",
+    "stopped": "操作者停止。继续前重新测量。",
+    "fault": "故障:运动已停止。",
+    "refused": "已拒绝:未启动任何运动。",
+    "features": "最大特征偏差 {max_feature_error_mm:.3f} mm,σ {feature_sigma_mm:.3f} mm,公差 {tolerance_mm:.3f} mm",
+    "truth": "真实最大偏差(仅仿真){true_max_feature_error_mm:.3f} mm",
+    "moves": "{moves} 次运动,单元时间 {virtual_time_s:.0f} s,计算用时 {wall_time_s:.1f} s",
+}
+
+
+def _error_json(error: DockingError) -> dict[str, Any]:
+    alarm = error.alarm(language=language())
+    body: dict[str, Any] = {
+        "code": alarm.code,
+        "message": alarm.message,
+        "where": alarm.where,
+        "value": alarm.value,
+        "limit": alarm.limit,
+        "remedy": alarm.remedy,
+    }
+    if isinstance(error, ConfigInvalid):
+        body["problems"] = list(error.problems)
+    return {"error": body}
+
+
+def _fail(error: DockingError, as_json: bool) -> int:
+    if as_json:
+        _print_json(_error_json(error))
+    else:
+        click.echo(f"{error.code}: {error.text(language())}\n    -> {error.remedy(language())}", err=True)
+    return error.exit_code
+
+
+def call(arguments: list[str]) -> int:
+    """Run one command and return its exit code; every error becomes words (or JSON), never a traceback."""
+    as_json = "--json" in arguments
+    try:
+        result = cli.main(arguments, prog_name="docking", standalone_mode=False)
+        return result if isinstance(result, int) else EXIT_OK
+    except click.UsageError as error:
+        where = error.ctx.command_path if error.ctx else "docking"
+        if not as_json and error.ctx:
+            click.echo(error.ctx.get_usage(), err=True)
+        return _fail(BadArgument(where, error.format_message(), value=" ".join(arguments[:1])), as_json)
+    except DockingError as error:
+        return _fail(error, as_json)
+    except (KeyboardInterrupt, click.Abort):
+        return _fail(StoppedByOperator("docking", "interrupted from the keyboard"), as_json)
+
+
+def main() -> None:
+    """Entry point of the `docking` program."""
+    sys.exit(call(sys.argv[1:]))

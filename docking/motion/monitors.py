@@ -1,0 +1,113 @@
+"""What is watched in every cycle. Every comparison is written so that NaN trips it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from docking.errors import (
+    BallForceTrip,
+    ConsistencyTrip,
+    DriveFault,
+    FeedbackMissing,
+    FollowingErrorTrip,
+    InternalForceTrip,
+    MotionError,
+    WarpTrip,
+)
+from docking.kinematics import CouplingMonitor, Positioners, coupling_monitor, socket_positions
+from docking.types import Array, Feedback
+
+
+@dataclass(frozen=True)
+class WatchLimits:
+    """Limits of the monitors (CELL file, `limits`): mm and N; following error grows with speed up to its ceiling."""
+
+    following_rest_mm: float
+    following_vmax_mm: float
+    ball_residual_mm: float
+    internal_force_n: float
+    warp_force_n: float
+    missing_cycles: float
+    overload_factor: float = 1.1
+
+
+class Watch:
+    """Judges read-backs against the commanded figure and keeps the maxima.
+
+    `evaluate` is the hot path: a handful of small array operations a cycle.
+    """
+
+    def __init__(self, positioners: Positioners, up: Array, limits: WatchLimits) -> None:
+        self._positioners, self._up, self._limits = positioners, up, limits
+        self._axes = positioners.axes
+        self._driven = np.asarray(positioners.driven, dtype=bool)
+        v_max = np.asarray(positioners.v_mm_s, dtype=np.float64)
+        self._following_slope = (limits.following_vmax_mm - limits.following_rest_mm) / v_max
+        self._rated_n = limits.overload_factor * np.asarray(positioners.rated_n, dtype=np.float64).reshape(-1)
+        self._coupling: CouplingMonitor | None = None
+        self.residual_mm = 0.0
+        self.internal_force_n = 0.0
+        self.warp_n = 0.0
+        self.reset_maxima()
+
+    def reset_maxima(self) -> None:
+        """Forget the maxima; called when a move starts."""
+        self.max_residual_mm = 0.0
+        self.max_internal_force_n = 0.0
+        self.max_following_mm = np.zeros(len(self._axes))
+
+    def watch_about(self, q_mm: Array) -> None:
+        """Linearise the coupling check about the socket figure at `q_mm` (m,)."""
+        self._coupling = coupling_monitor(
+            self._positioners, socket_positions(self._positioners, q_mm), self._up
+        )
+
+    def evaluate(self, feedback: Feedback, q_ref_mm: Array, speed_mm_s: Array | float) -> MotionError | None:
+        """The first violated limit, or None. `q_ref_mm` (m,) is the rigid figure the read-back belongs to."""
+        if feedback.fault is not None:
+            axis, code, text = feedback.fault
+            return DriveFault(axis, text, value=code)
+        worst_age = feedback.age_cycles.max()
+        if not (worst_age <= self._limits.missing_cycles):
+            axis = self._axes[int(np.argmax(feedback.age_cycles))]
+            return FeedbackMissing(axis, value=float(worst_age), limit=self._limits.missing_cycles)
+        return (
+            self._following(feedback.following_error_mm, speed_mm_s)
+            or self._figure(feedback.position_mm, q_ref_mm)
+            or self._ball_forces(feedback.force_n)
+        )
+
+    def _following(self, error_mm: Array, speed_mm_s: Array | float) -> MotionError | None:
+        magnitude = np.abs(error_mm)
+        np.maximum(self.max_following_mm, magnitude, out=self.max_following_mm)
+        limit = self._limits.following_rest_mm + self._following_slope * np.abs(speed_mm_s)
+        inside = (magnitude <= limit) | ~self._driven
+        if inside.all():
+            return None
+        k = int(np.argmin(inside))
+        return FollowingErrorTrip(self._axes[k], value=float(error_mm[k]), limit=float(limit[k]))
+
+    def _figure(self, position_mm: Array, q_ref_mm: Array) -> MotionError | None:
+        if self._coupling is None:
+            return None
+        residual, force, warp = self._coupling.evaluate(position_mm - q_ref_mm)
+        self.residual_mm, self.internal_force_n, self.warp_n = residual, force, warp
+        self.max_residual_mm = max(self.max_residual_mm, residual)
+        self.max_internal_force_n = max(self.max_internal_force_n, force)
+        limits = self._limits
+        if not (residual <= limits.ball_residual_mm):
+            return ConsistencyTrip("ball centres", value=residual, limit=limits.ball_residual_mm)
+        if not (force <= limits.internal_force_n):
+            return InternalForceTrip("ball centres", value=force, limit=limits.internal_force_n)
+        if not (abs(warp) <= limits.warp_force_n):
+            return WarpTrip("Z axes", value=warp, limit=limits.warp_force_n)
+        return None
+
+    def _ball_forces(self, force_n: Array) -> MotionError | None:
+        over = np.abs(force_n) > self._rated_n
+        if not over.any():
+            return None
+        k = int(np.argmax(over))
+        return BallForceTrip(self._axes[k], value=float(force_n[k]), limit=float(self._rated_n[k]))

@@ -1,0 +1,70 @@
+"""Path time: a plan's table is read at a rate that holds and stops bring to zero, so every stop stays on the path."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from docking.types import Array, Plan
+
+
+class Playback:
+    """Reads a plan's table at path time tau, d(tau)/dt = rate in 0..1.
+
+    A change of the rate takes 1.5 |change| / slew seconds along a cubic, so ds/dt is smooth and its largest slope is
+    the plan's `rate_slew_per_s`. Between two rows the set-point is interpolated linearly; the rows are so close
+    that the chord stays inside the plan's stated chord error.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan = plan
+        self.path_time_s = 0.0
+        self.rate = 1.0
+        self._from, self._to, self._since, self._span = 1.0, 1.0, 0.0, 0.0
+        self._q = plan.q_mm
+        self._last = len(plan.q_mm) - 1
+        self._period = plan.period_s
+
+    def turn_to(self, rate: float) -> None:
+        """Begin to bring the rate to `rate` (0 hold or stop, 1 run)."""
+        self._from, self._to, self._since = self.rate, rate, 0.0
+        self._span = 1.5 * abs(rate - self.rate) / self.plan.rate_slew_per_s
+
+    @property
+    def at_end(self) -> bool:
+        return self.path_time_s >= self.plan.duration_s
+
+    @property
+    def standing(self) -> bool:
+        return self.rate == 0.0 and self._to == 0.0
+
+    def advance(self, dt_s: float) -> Array:
+        """Move on by `dt_s` and return the set-point (m,)."""
+        if self.rate != self._to:
+            self._since += dt_s
+            u = min(1.0, self._since / self._span) if self._span > 0.0 else 1.0
+            before = self.rate
+            self.rate = self._to if u >= 1.0 else self._from + (self._to - self._from) * u * u * (3.0 - 2.0 * u)
+            self.path_time_s += 0.5 * (before + self.rate) * dt_s
+        else:
+            self.path_time_s += self.rate * dt_s
+        return self.setpoint_at(self.path_time_s)
+
+    def setpoint_at(self, path_time_s: float) -> Array:
+        """The set-point (m,) at a path time; clamped to the ends of the table."""
+        position = path_time_s / self._period
+        row = int(position)
+        if row >= self._last:
+            end: Array = self._q[self._last]
+            return end
+        fraction = position - row
+        if fraction < 1e-9:
+            exact: Array = self._q[row]
+            return exact
+        between: Array = self._q[row] + fraction * (self._q[row + 1] - self._q[row])
+        return between
+
+    def speed_at(self, path_time_s: float) -> Array:
+        """Axis speeds (m,) in mm/s of the table at a path time, times the present rate."""
+        row = min(int(max(path_time_s, 0.0) / self._period), self._last - 1)
+        speed: Array = np.abs(self._q[row + 1] - self._q[row]) * (self.rate / self._period)
+        return speed

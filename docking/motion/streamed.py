@@ -1,0 +1,154 @@
+"""Motion over a bus that takes one set-point a cycle: the tick, at a fixed rate on absolute deadlines."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from docking.errors import DockingError, DriveFault, FeedbackMissing, PlanStale, TickLate
+from docking.motion.monitors import Watch
+from docking.motion.playback import Playback
+from docking.motion.recorder import Recorder
+from docking.ports import StreamedPositioners
+from docking.types import Array, Feedback, Identity, MoveResult, Plan, readonly
+
+START_TOLERANCE_MM = 0.01
+LATE_LIMIT_CYCLES = 20
+TRACE_PERIOD_S = 0.1
+
+
+@dataclass
+class _Move:
+    """A running move."""
+
+    playback: Playback
+    recorder: Recorder
+    done: asyncio.Future[MoveResult]
+    stop_asked: bool = False
+
+
+class StreamedMotion:
+    """The `Motion` port over `StreamedPositioners`. Owns the tick from `enable` to `close`."""
+
+    def __init__(self, positioners: StreamedPositioners, watch: Watch) -> None:
+        self._bus, self._watch = positioners, watch
+        self.axes = positioners.axes
+        self._cycle_s = positioners.cycle_s
+        self._setpoint: Array = np.zeros(len(self.axes))
+        self._history: deque[Array] = deque(maxlen=3)
+        self._feedback: Feedback | None = None
+        self._loaded: Playback | None = None
+        self._move: _Move | None = None
+        self._cause: DockingError | None = None
+        self._timer: asyncio.Handle | None = None
+        self._deadline_s = 0.0
+        self._judged: Feedback | None = None
+
+    async def connect(self) -> tuple[Identity, ...]:
+        return await self._bus.bring_up()
+
+    async def enable(self) -> Array:
+        feedback = await self._bus.enable()
+        self._setpoint = readonly(feedback.position_mm)
+        self._history.extend([self._setpoint] * 3)
+        self._feedback, self._cause = feedback, None
+        self._watch.watch_about(self._setpoint)
+        loop = asyncio.get_running_loop()
+        self._deadline_s = loop.time()
+        self._timer = loop.call_soon(self._tick)
+        return self._setpoint
+
+    async def load(self, plan: Plan) -> None:
+        if self._cause is not None:
+            raise PlanStale(plan.stage, f"the motion side holds a fault: {self._cause}")
+        gap = float(np.max(np.abs(plan.q_mm[0] - self._setpoint)))
+        if not (gap <= START_TOLERANCE_MM):
+            raise PlanStale(plan.stage, f"it starts {gap:.4f} mm from where the axes are commanded")
+        self._watch.watch_about(plan.q_mm[0])
+        self._loaded = Playback(plan)
+
+    async def start(self, plan_hash: str) -> MoveResult:
+        playback, self._loaded = self._loaded, None
+        if playback is None or playback.plan.plan_hash != plan_hash:
+            raise PlanStale("motion", "another plan is loaded")
+        recorder = Recorder(self._watch, max(1, round(TRACE_PERIOD_S / self._cycle_s)))
+        done: asyncio.Future[MoveResult] = asyncio.get_running_loop().create_future()
+        self._move = _Move(playback, recorder, done)
+        return await done
+
+    def request(self, verb: str) -> None:
+        move = self._move
+        if move is None:
+            return
+        if verb == "resume":
+            if not move.stop_asked and self._cause is None:
+                move.playback.turn_to(1.0)
+            return
+        move.stop_asked = move.stop_asked or verb == "stop"
+        move.playback.turn_to(0.0)
+
+    def feedback(self) -> Feedback:
+        if self._feedback is None:
+            raise PlanStale("motion", "the positioners are not enabled")
+        return self._feedback
+
+    async def close(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        await self._bus.close()
+
+    def _tick(self) -> None:
+        loop = asyncio.get_running_loop()
+        now = loop.time()
+        move = self._move
+        if move is not None:
+            self._setpoint = move.playback.advance(self._cycle_s)
+        self._history.append(self._setpoint)
+        feedback = self._bus.exchange(self._setpoint)
+        self._feedback = feedback
+        cause = self._judge(feedback, move) or self._lateness(now - self._deadline_s)
+        if cause is not None and self._cause is None:
+            self._trip(cause, move)
+        if move is not None:
+            self._follow(move, feedback)
+        # Missed deadlines are skipped, never made up for in a burst.
+        self._deadline_s = max(self._deadline_s + self._cycle_s, now)
+        self._timer = loop.call_at(self._deadline_s, self._tick)
+
+    def _judge(self, feedback: Feedback, move: _Move | None) -> DockingError | None:
+        if move is None:
+            if feedback is self._judged:
+                return None
+            self._judged = feedback
+            return self._watch.evaluate(feedback, self._history[0], 0.0)
+        # A read-back belongs to the set-point of two cycles ago: one cycle on the bus, one until the drive applies it.
+        speed = move.playback.speed_at(move.playback.path_time_s)
+        return self._watch.evaluate(feedback, self._history[0], speed)
+
+    def _lateness(self, late_s: float) -> DockingError | None:
+        limit = LATE_LIMIT_CYCLES * self._cycle_s
+        return TickLate("motion", value=late_s, limit=limit) if not (late_s <= limit) else None
+
+    def _trip(self, cause: DockingError, move: _Move | None) -> None:
+        self._cause = cause
+        if isinstance(cause, DriveFault | FeedbackMissing):
+            self._bus.quick_stop()
+        if move is not None:
+            move.playback.turn_to(0.0)
+
+    def _follow(self, move: _Move, feedback: Feedback) -> None:
+        playback = move.playback
+        move.recorder.add(feedback, playback.path_time_s)
+        stopped = playback.standing and (move.stop_asked or self._cause is not None)
+        if not (playback.at_end or stopped):
+            return
+        outcome = "fault" if self._cause else "stopped" if stopped else "done"
+        alarm = self._cause.alarm(feedback.t_s) if self._cause else None
+        result = move.recorder.result(outcome, playback.path_time_s, self._setpoint, alarm)
+        self._move = None
+        if not move.done.done():
+            move.done.set_result(result)

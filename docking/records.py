@@ -1,0 +1,132 @@
+"""Nouns as journal bodies: what the report and `--json` are made from. Angles leave in degrees."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from docking.geometry import pose_to_vector
+from docking.types import Alarm, FeatureErrors, Fit, MoveResult, Plan, Pose, Rejection
+
+POSE_KEYS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
+
+
+def pose_record(X: Pose) -> dict[str, float]:
+    """The border form of a pose with its names."""
+    return dict(zip(POSE_KEYS, pose_to_vector(X).tolist(), strict=True))
+
+
+def rejection_records(rejected: tuple[Rejection, ...]) -> list[dict[str, str]]:
+    return [{"name": r.name, "reason": r.reason, "detail": r.detail} for r in rejected]
+
+
+def _residuals(fit: Fit) -> dict[str, list[float]]:
+    return dict(zip(fit.names, fit.residuals_mm.tolist(), strict=True))
+
+
+def station_record(X_WT: Fit) -> dict[str, Any]:
+    return {
+        "X_WT": X_WT.X_MN.matrix().tolist(),
+        "rms_mm": X_WT.rms_mm,
+        "max_mm": X_WT.max_mm,
+        "residuals_mm": _residuals(X_WT),
+        "rejected": rejection_records(X_WT.rejected),
+    }
+
+
+def fit_record(fit: Fit, what: str, stage: str) -> dict[str, Any]:
+    return {
+        "what": what,
+        "stage": stage,
+        "X": fit.X_MN.matrix().tolist(),
+        "pose": pose_record(fit.X_MN),
+        "rms_mm": fit.rms_mm,
+        "max_mm": fit.max_mm,
+        "method": fit.method,
+        "iterations": fit.iterations,
+        "chi2": fit.chi2,
+        "dof": fit.dof,
+        "used": list(fit.names),
+        "rejected": rejection_records(fit.rejected),
+        "residuals_mm": _residuals(fit),
+    }
+
+
+def features_record(errors: FeatureErrors, stage: str, when: str) -> dict[str, Any]:
+    return {
+        "stage": stage,
+        "when": when,
+        "names": list(errors.names),
+        "error_mm": errors.error_mm.tolist(),
+        "norm_mm": errors.norm_mm.tolist(),
+        "sigma_mm": errors.sigma_mm.tolist(),
+        "tolerance_mm": errors.tolerance_mm.tolist(),
+        "accepted": errors.accepted(),
+    }
+
+
+def plan_record(plan: Plan) -> dict[str, Any]:
+    c = plan.correction
+    return {
+        "plan_id": plan.plan_id,
+        "plan_hash": plan.plan_hash,
+        "stage": plan.stage,
+        "kind": plan.kind,
+        "duration_s": plan.duration_s,
+        "displacement_mm": dict(zip(plan.axes, plan.displacement_mm.tolist(), strict=True)),
+        "speed_limited_by": plan.speed_limited_by,
+        "chord_error_mm": plan.chord_error_mm,
+        "margins": [list(row) for row in plan.margins],
+        "correction": {
+            "rotvec_deg": np.degrees(c.rotvec_rad).tolist(),
+            "shift_mm": c.shift_mm.tolist(),
+            "pivot_mm": c.pivot_W_mm.tolist(),
+        },
+    }
+
+
+def intent_record(plan: Plan) -> dict[str, Any]:
+    return {
+        "plan_hash": plan.plan_hash,
+        "start_mm": dict(zip(plan.axes, plan.q_mm[0].tolist(), strict=True)),
+        "target_mm": dict(zip(plan.axes, plan.q_mm[-1].tolist(), strict=True)),
+    }
+
+
+def moved_record(plan: Plan, result: MoveResult) -> dict[str, Any]:
+    trace = result.trace
+    return {
+        "plan_hash": plan.plan_hash,
+        "result": result.result,
+        "path_time_s": result.path_time_s,
+        "trace": {
+            "t_s": trace.t_s.tolist(),
+            "path_time_s": trace.path_time_s.tolist(),
+            "position_mm": _by_axis(plan.axes, trace.position_mm),
+            "following_error_mm": _by_axis(plan.axes, trace.following_error_mm),
+            "residual_mm": trace.residual_mm.tolist(),
+            "internal_force_n": trace.internal_force_n.tolist(),
+            "force_n": _by_axis(plan.axes, trace.force_n),
+        },
+        "max_following_error_mm": dict(zip(plan.axes, result.max_following_error_mm.tolist(), strict=True)),
+        "max_consistency_residual_mm": result.max_residual_mm,
+        "max_internal_force_n": result.max_internal_force_n,
+    }
+
+
+def _by_axis(axes: tuple[str, ...], table: np.ndarray[Any, Any]) -> dict[str, list[float]]:
+    # Four digits after the point (0.1 um, 0.1 mN) keep the journal small and are finer than any sensor here.
+    rounded = np.round(table, 4)
+    return {axis: rounded[:, k].tolist() for k, axis in enumerate(axes)}
+
+
+def alarm_record(alarm: Alarm) -> dict[str, Any]:
+    return {
+        "code": alarm.code,
+        "message": alarm.message,
+        "where": alarm.where,
+        "value": alarm.value,
+        "limit": alarm.limit,
+        "remedy": alarm.remedy,
+    }
