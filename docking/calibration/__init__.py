@@ -1,0 +1,1 @@
+"""Where things stand: the tracker in the assembly frame, reference checks."""

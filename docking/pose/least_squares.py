@@ -1,0 +1,135 @@
+"""Least-squares rigid fits, [Luo] method 3: equal weights over Euler angles, and maximum likelihood on SE(3).
+
+With equal weights the minimum is the one `fit_svd` gives in closed form. With covariances the fit is the
+maximum-likelihood estimate and reaches the Cramer-Rao bound, which no unweighted method does (numerics C).
+"""
+
+from __future__ import annotations
+
+from math import cos, sin
+from typing import NamedTuple
+
+import numpy as np
+
+from docking.errors import NotCongruent
+from docking.geometry import euler_to_matrix, exp_so3, matrix_to_euler, skew
+from docking.pose.three_point import fit_three_point
+from docking.types import Array, Pose
+
+_MAX_ITERATIONS = 60
+
+
+class Solution(NamedTuple):
+    """Pose X_MN, iterations used, covariance (7, 7) of [rotation, translation, expansion] about the pivot, expansion."""
+
+    X_MN: Pose
+    iterations: int
+    cov: Array
+    pivot_mm: Array
+    expansion: float
+
+
+def _step_limit_mm(points_mm: Array) -> float:
+    """A step below this is rounding: the points move by less than a few units in the last place."""
+    return 1e-11 + 8.0 * float(np.finfo(np.float64).eps) * float(np.max(np.abs(points_mm)))
+
+
+def euler_jacobian(alpha_rad: float, beta_rad: float, gamma_rad: float, nominal_mm: Array) -> Array:
+    """d(R J_i + T)/d(alpha, beta, gamma, x, y, z), shape (n, 3, 6); the Jacobian J(X) of [Luo] Eq. 11."""
+    ca, sa, cb, sb, cg, sg = (f(v) for v in (alpha_rad, beta_rad, gamma_rad) for f in (cos, sin))
+    rz = np.array([[cg, -sg, 0.0], [sg, cg, 0.0], [0.0, 0.0, 1.0]])
+    ry = np.array([[cb, 0.0, sb], [0.0, 1.0, 0.0], [-sb, 0.0, cb]])
+    rx = np.array([[1.0, 0.0, 0.0], [0.0, ca, -sa], [0.0, sa, ca]])
+    d_alpha = rz @ ry @ rx @ skew([1.0, 0.0, 0.0])
+    d_beta = rz @ skew([0.0, 1.0, 0.0]) @ ry @ rx
+    d_gamma = skew([0.0, 0.0, 1.0]) @ rz @ ry @ rx
+    jac = np.zeros((len(nominal_mm), 3, 6))
+    for k, d in enumerate((d_alpha, d_beta, d_gamma)):
+        jac[:, :, k] = nominal_mm @ d.T
+    jac[:, :, 3:] = np.eye(3)
+    return jac
+
+
+def fit_gauss_newton(nominal_mm: Array, measured_mm: Array, start: Pose | None = None) -> tuple[Pose, int]:
+    """Equal-weight minimum of [Luo] Eq. 9 by Gauss-Newton, Eq. 12, from the three-point pose; with its iterations.
+
+    The points are centred and the angles scaled by the rms radius, so the system is well conditioned at any distance.
+    """
+    j0, p0 = nominal_mm.mean(axis=0), measured_mm.mean(axis=0)
+    j, p = nominal_mm - j0, measured_mm - p0
+    X = fit_three_point(nominal_mm, measured_mm) if start is None else start
+    euler = matrix_to_euler(X.R)
+    angles, t = np.array(euler[:3]), X.apply(j0) - p0
+    radius = float(np.sqrt(np.mean(np.sum(j * j, axis=1))))
+    scale = np.array([1.0 / radius] * 3 + [1.0] * 3)
+    for iteration in range(1, _MAX_ITERATIONS + 1):
+        f = j @ euler_to_matrix(*angles).T + t - p
+        a = euler_jacobian(angles[0], angles[1], angles[2], j).reshape(-1, 6) * scale
+        step = np.linalg.lstsq(a, -f.reshape(-1), rcond=1e-12)[0]
+        angles, t = angles + step[:3] * scale[:3], t + step[3:]
+        if float(np.linalg.norm(step)) < _step_limit_mm(j):
+            R = euler_to_matrix(*angles)
+            return Pose(R, p0 + t - R @ j0), iteration
+    raise NotCongruent("fit", "Gauss-Newton does not converge", value=len(nominal_mm), limit=len(nominal_mm))
+
+
+def design(points_mm: Array, pivot_mm: Array) -> Array:
+    """How points (n, 3) move with [w, d, e] about a pivot: `w x (q - c) + d + e (q - c)`, shape (n, 3, 7)."""
+    arm = points_mm - pivot_mm
+    jac = np.zeros((len(points_mm), 3, 7))
+    jac[:, :, :3] = -skew(arm)
+    jac[:, :, 3:6] = np.eye(3)
+    jac[:, :, 6] = arm
+    return jac
+
+
+def weighted_centroid(points_mm: Array, cov_mm2: Array) -> Array:
+    """Centroid (3,) of points (n, 3) with the weights 1 / trace of their covariances (n, 3, 3)."""
+    w = 1.0 / np.trace(cov_mm2, axis1=1, axis2=2)
+    result: Array = w @ points_mm / w.sum()
+    return result
+
+
+def _solve(normal: Array, rhs: Array, radius_mm: float, free: int) -> tuple[Array, Array]:
+    """Step (7,) and covariance (7, 7) of scaled normal equations; parameters from `free` on are held at zero."""
+    scale = np.array([1.0 / radius_mm] * 3 + [1.0] * 3 + [1.0 / radius_mm])[:free]
+    n = normal[:free, :free] * np.outer(scale, scale)
+    step, cov = np.zeros(7), np.zeros((7, 7))
+    inverse = np.linalg.inv((n + n.T) / 2.0)
+    step[:free] = scale * (inverse @ (scale * rhs[:free]))
+    cov[:free, :free] = inverse * np.outer(scale, scale)
+    return step, cov
+
+
+def fit_maximum_likelihood(
+    nominal_mm: Array, measured_mm: Array, covs_mm2: tuple[Array, Array], start: Pose, expansion_sigma: float = 0.0
+) -> Solution:
+    """Maximum-likelihood pose (numerics C): minimises `sum r^T S^-1 r (+ (e / sigma_e)^2)`, r = P - (R J + T).
+
+    `covs_mm2` = (nominal in N, measured in M), each (n, 3, 3); S_i = S_Pi + R S_Ji R^T follows the rotation. Steps are
+    Gauss-Newton on the manifold about the weighted centroid c of the measured points; with `expansion_sigma` > 0 a
+    uniform expansion e about c is estimated too. The covariance is N^-1, N = sum A^T S^-1 A.
+    """
+    nominal_cov, measured_cov = covs_mm2
+    X, e = start, 0.0
+    free = 7 if expansion_sigma > 0.0 else 6
+    c = weighted_centroid(measured_mm, measured_cov + X.R @ nominal_cov @ X.R.T)
+    radius = max(float(np.sqrt(np.mean(np.sum((measured_mm - c) ** 2, axis=1)))), 1e-9)
+    for iteration in range(1, _MAX_ITERATIONS + 1):
+        q = X.apply(nominal_mm)
+        a = design(q, c)
+        weight = np.linalg.inv(measured_cov + X.R @ nominal_cov @ X.R.T)
+        r = measured_mm - q - e * (q - c)
+        aw = a.transpose(0, 2, 1) @ weight
+        normal, rhs = (aw @ a).sum(axis=0), (aw @ r[:, :, None]).sum(axis=0)[:, 0]
+        if free == 7:
+            normal[6, 6] += expansion_sigma**-2
+            rhs[6] -= e * expansion_sigma**-2
+        step, cov = _solve(normal, rhs, radius, free)
+        turn = exp_so3(step[:3])
+        X = Pose(turn @ X.R, turn @ (X.t_mm - c) + c + step[3:6])
+        e += float(step[6])
+        moved = radius * (float(np.linalg.norm(step[:3])) + abs(float(step[6]))) + float(np.linalg.norm(step[3:6]))
+        if moved < _step_limit_mm(measured_mm):
+            return Solution(X, iteration, cov, c, e)
+    raise NotCongruent("fit", "the weighted fit does not converge", value=len(nominal_mm), limit=len(nominal_mm))

@@ -1,0 +1,240 @@
+"""Screening of points before the fit ([Luo], made sharp): which points are what they claim to be?
+
+Passes are compared and averaged; every pair's measured distance is compared with the nominal one, and the pairs inside
+their tolerance are the edges of a graph; its largest set of mutually consistent points is kept; then data snooping on
+the fit settles the borderline. The tolerance comes from the covariances; where none are given, from the data.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from docking.errors import AmbiguousSet, NotCongruent, PoseError, TooFewPoints
+from docking.pose.clique import adjacency, bits, largest_clique, rival_clique
+from docking.pose.layout import MIN_POINTS, check_layout
+from docking.pose.pairs import check_units, distances, estimated_sigma_mm, estimated_tolerance_mm, pair_tolerance_mm
+from docking.pose.passes import Averaged, average_passes
+from docking.pose.settings import FitSettings
+from docking.pose.snooping import Pairs, Tested, residuals_mm, snoop
+from docking.pose.svd import fit_svd, mirrored_rms_mm
+from docking.types import Array, Points, Rejection, Screened
+
+_SHRINKS = 6
+_SMALLEST_SIGMA_MM = 1e-4
+"""Estimated sigmas do not fall below this: noiseless files still carry rounding."""
+
+
+class _Graph(NamedTuple):
+    """Consistency of pairs: bit masks, the largest clique's rows, tolerance (n, n), estimated sigma (None: given)."""
+
+    adj: list[int]
+    clique: list[int]
+    tolerance_mm: Array
+    sigma_mm: float | None
+
+
+def screen(nominal: Points, measured: Points, settings: FitSettings | None = None) -> Screened:
+    """Keep the points of `measured` (frame M, any number of passes) that are congruent with `nominal` (frame N).
+
+    A covariance that is not known is NaN. Raises TooFewPoints, DegenerateTargets, UnitMixUp, NotCongruent,
+    AmbiguousSet, StationMoved; the error's `rejected` holds what had been found out about single points by then.
+    """
+    settings = FitSettings() if settings is None else settings
+    averaged = Averaged()
+    try:
+        averaged = average_passes(measured, settings)
+        averaged.rejected += _unmatched(nominal, measured)
+        pairs = _matched(nominal, averaged)
+        return _screen_pairs(pairs, averaged, settings)
+    except PoseError as error:
+        error.rejected = (*error.rejected, *averaged.rejected)
+        raise
+
+
+def _unmatched(nominal: Points, measured: Points) -> list[Rejection]:
+    """Names that only one of the two sides knows."""
+    known, seen = set(nominal.names), dict.fromkeys(measured.names)
+    missing = [Rejection(n, "unmatched", "not measured") for n in nominal.names if n not in seen]
+    return missing + [Rejection(n, "unmatched", "no nominal point of this name") for n in seen if n not in known]
+
+
+def _matched(nominal: Points, averaged: Averaged) -> Pairs:
+    """Points with a nominal and a usable measured position, in the order of the nominal."""
+    row = {name: i for i, name in enumerate(averaged.names)}
+    names = tuple(name for name in dict.fromkeys(nominal.names) if name in row)
+    j = [nominal.names.index(name) for name in names]
+    i = [row[name] for name in names]
+    known = set(nominal.names)
+    averaged.rejected[:] = [r for r in averaged.rejected if r.name in known or r.reason == "unmatched"]
+    xyz = np.array([averaged.xyz_mm[k] for k in i]).reshape(-1, 3)
+    cov = np.array([averaged.cov_mm2[k] for k in i]).reshape(-1, 3, 3)
+    return Pairs(names, nominal.xyz_mm[j].reshape(-1, 3), xyz, nominal.cov_mm2[j].reshape(-1, 3, 3), cov)
+
+
+def _screen_pairs(pairs: Pairs, averaged: Averaged, settings: FitSettings) -> Screened:
+    """Screen matched points; see `screen`."""
+    if not (len(pairs.names) >= MIN_POINTS):
+        raise TooFewPoints(settings.where, _named(averaged.rejected), value=len(pairs.names), limit=MIN_POINTS)
+    check_layout(pairs.nominal_mm, settings)
+    check_units(pairs.nominal_mm, pairs.measured_mm, settings)
+    graph = _consistency(pairs, settings)
+    if not (len(graph.clique) >= settings.min_agreeing):
+        raise _not_congruent(pairs, graph, settings)
+    check_layout(pairs.nominal_mm[graph.clique], settings)
+    _check_mirror(pairs.rows(graph.clique), graph, settings)
+    scaled, given = graph.sigma_mm is not None, pairs
+    pairs = given if graph.sigma_mm is None else _with_sigma(given, graph.sigma_mm)
+    tested = snoop(pairs, graph.clique, settings.false_alarm, settings.expansion_sigma, scaled)
+    _check_unique(pairs, graph, tested, settings)
+    _check_deformed(pairs, graph, tested, settings)
+    if scaled:
+        pairs = _with_sigma(given, _posterior_sigma_mm(pairs, tested))
+    kept = pairs.rows(tested.kept)
+    out = [_explain(pairs, tested, i) for i in range(len(pairs.names)) if i not in set(tested.kept)]
+    rejected = (*out, *averaged.rejected)
+    return Screened(
+        kept.names,
+        kept.nominal_mm,
+        kept.nominal_cov_mm2,
+        kept.measured_mm,
+        kept.measured_cov_mm2,
+        rejected,
+        tuple(averaged.dropped),
+    )
+
+
+# Which pairs agree -----------------------------------------------------------------------------------------------
+def _consistency(pairs: Pairs, settings: FitSettings) -> _Graph:
+    """Graph of consistent pairs and its largest clique, with the tolerance known or estimated."""
+    difference = np.abs(distances(pairs.measured_mm) - distances(pairs.nominal_mm))
+    if _all_known(pairs):
+        tolerance = pair_tolerance_mm(
+            pairs.nominal_mm, pairs.measured_mm, (pairs.nominal_cov_mm2, pairs.measured_cov_mm2), settings
+        )
+        adj = adjacency(difference <= tolerance)
+        return _Graph(adj, bits(largest_clique(adj)), tolerance, None)
+    return _estimated_graph(pairs, difference)
+
+
+def _all_known(pairs: Pairs) -> bool:
+    return bool(np.all(np.isfinite(pairs.nominal_cov_mm2)) and np.all(np.isfinite(pairs.measured_cov_mm2)))
+
+
+def _estimated_graph(pairs: Pairs, difference: Array) -> _Graph:
+    """Graph whose tolerance follows from the pairs themselves.
+
+    The first scale sees all points, so bad ones widen it; it is estimated again inside the clique found with it until
+    it no longer shrinks.
+    """
+    n = len(difference)
+    inside, sigma = list(range(n)), np.inf
+    graph = _Graph([], [], difference, None)
+    for _ in range(_SHRINKS):
+        found = estimated_sigma_mm(difference[np.ix_(inside, inside)], float(np.ptp(pairs.nominal_mm)))
+        if not (found < 0.95 * sigma):
+            break
+        sigma = found
+        tolerance = estimated_tolerance_mm(len(inside), sigma)
+        adj = adjacency(difference <= tolerance)
+        inside = bits(largest_clique(adj))
+        graph = _Graph(adj, inside, np.full_like(difference, tolerance), sigma)
+        if len(inside) < MIN_POINTS:
+            break
+    return graph
+
+
+def _with_sigma(pairs: Pairs, sigma_mm: float) -> Pairs:
+    """The pairs with an isotropic covariance where none was given, so that the total is sigma^2 a coordinate."""
+    sides = [pairs.nominal_cov_mm2, pairs.measured_cov_mm2]
+    unknown = [~np.all(np.isfinite(c), axis=(1, 2)) for c in sides]
+    given = np.zeros(len(pairs.names))
+    for cov, miss in zip(sides, unknown, strict=True):
+        given += np.where(miss, 0.0, np.trace(np.nan_to_num(cov), axis1=1, axis2=2) / 3.0)
+    missing = unknown[0].astype(int) + unknown[1].astype(int)
+    share = np.maximum(sigma_mm**2 - given, _SMALLEST_SIGMA_MM**2) / np.maximum(missing, 1)
+    filled = [
+        np.where(miss[:, None, None], share[:, None, None] * np.eye(3), cov)
+        for cov, miss in zip(sides, unknown, strict=True)
+    ]
+    return Pairs(pairs.names, pairs.nominal_mm, pairs.measured_mm, filled[0], filled[1])
+
+
+# Is the answer to be believed ------------------------------------------------------------------------------------
+def _not_congruent(pairs: Pairs, graph: _Graph, settings: FitSettings) -> NotCongruent:
+    agreeing = [(graph.adj[i]).bit_count() for i in range(len(pairs.names))]
+    most = max(agreeing)
+    accused = [i for i in range(len(pairs.names)) if agreeing[i] < most] or list(range(len(pairs.names)))
+    names = ", ".join(pairs.names[i] for i in accused[:8])
+    error = NotCongruent(
+        settings.where,
+        f"{names} disagree with the others by more than {np.median(graph.tolerance_mm):.3g} mm",
+        value=len(graph.clique),
+        limit=settings.min_agreeing,
+    )
+    others = len(pairs.names) - 1
+    error.rejected = tuple(
+        Rejection(pairs.names[i], "inconsistent", f"its distances agree with {agreeing[i]} of {others} points")
+        for i in accused
+    )
+    return error
+
+
+def _check_mirror(pairs: Pairs, graph: _Graph, settings: FitSettings) -> None:
+    """Refuse a point set that is the nominal's mirror image: its distances all agree and only a reflection fits."""
+    r = pairs.measured_mm - fit_svd(pairs.nominal_mm, pairs.measured_mm).apply(pairs.nominal_mm)
+    proper = float(np.sqrt(np.mean(np.sum(r * r, axis=1))))
+    limit = float(np.max(graph.tolerance_mm[np.ix_(graph.clique, graph.clique)]))
+    reflected = mirrored_rms_mm(pairs.nominal_mm, pairs.measured_mm)
+    if proper > 3.0 * limit and 3.0 * reflected < proper:
+        cause = (
+            f"they are its mirror image (rms {proper:.3g} mm, reflected {reflected:.3g} mm): an axis has the wrong sign"
+        )
+        raise NotCongruent(settings.where, cause, value=0, limit=settings.min_agreeing)
+
+
+def _check_unique(pairs: Pairs, graph: _Graph, tested: Tested, settings: FitSettings) -> None:
+    """Refuse when other points, with at most two of the kept ones, agree among themselves just as many."""
+    kept = sum(1 << i for i in tested.kept)
+    rival = bits(rival_clique(graph.adj, kept, len(graph.clique)))
+    if rival:
+        first, second = (", ".join(pairs.names[i] for i in rows[:8]) for rows in (graph.clique, rival))
+        raise AmbiguousSet(settings.where, f"{first} agree among themselves, and so do {second}", value=len(rival))
+
+
+def _check_deformed(pairs: Pairs, graph: _Graph, tested: Tested, settings: FitSettings) -> None:
+    """Refuse when points would have to be deleted one after another until the rest fits: the part is deformed."""
+    allowed = max(1, len(graph.clique) // 4)
+    if not (tested.snooped <= allowed):
+        cause = f"{tested.snooped} points would have to go until the rest fits: deformed part, or sigmas too small"
+        raise NotCongruent(settings.where, cause, value=len(tested.kept), limit=len(graph.clique) - allowed)
+
+
+def _posterior_sigma_mm(pairs: Pairs, tested: Tested) -> float:
+    """sqrt(sum |r|^2 / (3 n - 6)) of the kept points."""
+    r = residuals_mm(pairs.rows(tested.kept), tested.solution)
+    return max(float(np.sqrt(np.sum(r * r) / max(3 * len(r) - 6, 1))), _SMALLEST_SIGMA_MM)
+
+
+# What was wrong with a point -------------------------------------------------------------------------------------
+def _explain(pairs: Pairs, tested: Tested, i: int) -> Rejection:
+    """Name what happened to a rejected point: `swapped`, `wrong-nest` or `mis-aimed`."""
+    places = tested.solution.X_MN.apply(pairs.nominal_mm)
+    off = float(np.linalg.norm(pairs.measured_mm[i] - places[i]))
+    gap = np.linalg.norm(places - pairs.measured_mm[i], axis=1)
+    gap[i] = np.inf
+    j = int(np.argmin(gap))
+    reach = 4.0 * float(np.sqrt(np.max(np.trace(pairs.measured_cov_mm2 + pairs.nominal_cov_mm2, axis1=1, axis2=2))))
+    if gap[j] <= min(reach, 0.2 * off):
+        if float(np.linalg.norm(pairs.measured_mm[j] - places[i])) <= min(reach, 0.2 * off):
+            return Rejection(pairs.names[i], "swapped", f"swapped with {pairs.names[j]}")
+        return Rejection(
+            pairs.names[i], "wrong-nest", f"measured where {pairs.names[j]} should be, {off:.3f} mm from its place"
+        )
+    return Rejection(pairs.names[i], "mis-aimed", f"{off:.3f} mm from where the other points put it")
+
+
+def _named(rejected: list[Rejection]) -> str:
+    """The first rejected points with their reasons, for the cause of an error."""
+    return ", ".join(f"{r.name}: {r.reason}" for r in rejected[:8])

@@ -1,0 +1,71 @@
+"""Covariance of fitted poses, and what it means at a point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from docking.geometry import log_so3
+from docking.pose.least_squares import design
+from docking.types import Array, Fit, Pose
+
+Estimator = Callable[[Array, Array], Pose]
+
+
+def total_cov_mm2(nominal_cov: Array, measured_cov: Array, R: Array) -> Array:
+    """Covariance (n, 3, 3) of `P - (R J + T)` in M: measured plus turned nominal."""
+    result: Array = measured_cov + R @ nominal_cov @ R.T
+    return result
+
+
+def unweighted_cov(points_M_mm: Array, cov_mm2: Array, pivot_mm: Array) -> Array:
+    """Covariance (6, 6) about the pivot of the EQUALLY weighted fit when its points have the covariances (n, 3, 3).
+
+    The estimate is `(A^T A)^-1 A^T r`, hence `(A^T A)^-1 A^T S A (A^T A)^-1`.
+    """
+    a = design(points_M_mm, pivot_mm)[:, :, :6]
+    radius = max(float(np.sqrt(np.mean(np.sum((points_M_mm - pivot_mm) ** 2, axis=1)))), 1e-9)
+    scale = np.array([1.0 / radius] * 3 + [1.0] * 3)
+    a = a * scale
+    inverse = np.linalg.inv(np.einsum("nik,nil->kl", a, a))
+    middle = np.einsum("nik,nij,njl->kl", a, cov_mm2, a)
+    cov: Array = (inverse @ middle @ inverse) * np.outer(scale, scale)
+    return cov
+
+
+def propagated_cov(
+    estimator: Estimator, nominal_mm: Array, measured_mm: Array, cov_mm2: Array, pivot_mm: Array
+) -> Array:
+    """Covariance (6, 6) about the pivot of any estimator, by central differences over the coordinates (n, 3)."""
+    X = estimator(nominal_mm, measured_mm)
+    h = 1e-4 * max(float(np.ptp(measured_mm)), 1e-3)
+    cov = np.zeros((6, 6))
+    for i in range(len(measured_mm)):
+        gain = np.zeros((6, 3))
+        for k in range(3):
+            delta = np.zeros_like(measured_mm)
+            delta[i, k] = h
+            plus, minus = estimator(nominal_mm, measured_mm + delta), estimator(nominal_mm, measured_mm - delta)
+            gain[:, k] = (pose_difference(plus, X, pivot_mm) - pose_difference(minus, X, pivot_mm)) / (2.0 * h)
+        cov += gain @ cov_mm2[i] @ gain.T
+    return cov
+
+
+def pose_difference(X_est: Pose, X_true: Pose, pivot_mm: Array) -> Array:
+    """[rotation_rad, translation_mm] (6,) about the pivot (3,) in M that carries X_true to X_est."""
+    w = log_so3(X_est.R @ X_true.R.T)
+    at = X_true.inverse().apply(pivot_mm)
+    return np.concatenate([w, X_est.apply(at) - pivot_mm])
+
+
+def nees(fit: Fit, X_true: Pose) -> float:
+    """Normalised squared error of a fit against the truth: mean 6 when its covariance is honest."""
+    d = pose_difference(fit.X_MN, X_true, fit.pivot_mm)
+    return float(d @ np.linalg.solve(fit.cov, d))
+
+
+def largest_sigma_mm(cov_mm2: Array) -> Array:
+    """sqrt of the largest eigenvalue of each covariance (..., 3, 3)."""
+    result: Array = np.sqrt(np.linalg.eigvalsh(cov_mm2)[..., -1])
+    return result
