@@ -20,11 +20,22 @@ def positioners_from(cell: CellFile, job: JobFile) -> Positioners:
     The balls sit straight in their sockets in the docked attitude. The files must have passed their checks: a
     positioner without a ball raises KeyError.
     """
-    stations = cell.positioners
-    axes = [axis for station in stations for axis in station.axes]
     balls = {ball.positioner: ball.xyz_mm for ball in job.component.balls}
     part = job.component
     grown = 1.0 + part.expansion_per_k * (part.temperature_c - cell.temperature_c)
+    figure = np.array([balls[station.name] for station in cell.positioners])
+    return _positioners(cell, figure * grown, docked_pose(cell, job).R)
+
+
+def positioners_of(cell: CellFile) -> Positioners:
+    """The cell's positioners before any job: balls where the sockets are with all axes at zero, about their middle."""
+    origins = np.array([station.origin_mm for station in cell.positioners])
+    return _positioners(cell, origins - origins.mean(axis=0), np.eye(3))
+
+
+def _positioners(cell: CellFile, balls_C_mm: Array, neutral_R_WC: Array) -> Positioners:
+    stations = cell.positioners
+    axes = [axis for station in stations for axis in station.axes]
     return Positioners(
         names=tuple(station.name for station in stations),
         axes=cell.axis_names,
@@ -39,8 +50,8 @@ def positioners_from(cell: CellFile, job: JobFile) -> Positioners:
         stiffness_n_per_mm=np.array([station.stiffness_n_per_mm for station in stations]),
         rated_n=np.array([station.rated_n for station in stations]),
         swivel_rad=np.radians([station.swivel_deg for station in stations]),
-        balls_C_mm=np.array([balls[station.name] for station in stations]) * grown,
-        neutral_R_WC=docked_pose(cell, job).R,
+        balls_C_mm=balls_C_mm,
+        neutral_R_WC=neutral_R_WC,
     )
 
 

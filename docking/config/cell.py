@@ -12,133 +12,187 @@ from docking.config.base import Finite, Fraction, Model, Name, NonNegative, Pose
 class Noise(Model):
     """Noise of the instrument, one standard deviation; set only to override the device class."""
 
-    range_um: Positive = Field(description="constant part along the line of sight")
-    range_um_per_m: NonNegative
-    transverse_um: NonNegative = Field(description="constant part across the line of sight")
-    transverse_um_per_m: NonNegative
+    range_um: Positive = Field(description="constant part along the line of sight, um, 1 sigma")
+    range_um_per_m: NonNegative = Field(
+        description="part along the line of sight that grows with the distance, um per m"
+    )
+    transverse_um: NonNegative = Field(description="constant part across the line of sight, um, 1 sigma")
+    transverse_um_per_m: NonNegative = Field(
+        description="part across the line of sight that grows with the distance, um per m"
+    )
 
 
 class ErsPoint(Model):
     """A fixed reference point that defines the assembly frame W."""
 
-    name: Name
-    xyz_mm: Vector3
-    sigma_mm: Positive
+    name: Name = Field(description="as the instrument knows it")
+    xyz_mm: Vector3 = Field(description="surveyed reflector centre in W, mm")
+    sigma_mm: Positive = Field(description="of the survey, 1 sigma a coordinate, mm")
 
 
 class TrackerConfig(Model):
-    protocol: Literal["line", "geocom"]
-    port: str = Field(min_length=1, description="any pyserial URL: /dev/ttyUSB0, socket://host:port, rfc2217://host:port")
-    baud: Annotated[int, Field(ge=1200, le=1_000_000)] = 115200
-    device_class: Literal["laser-tracker", "total-station"]
-    noise: Noise | None = None
-    station_pose: PoseVector = Field(description="approximate X_WT; refined from the ERS points")
-    ers: tuple[ErsPoint, ...] = Field(min_length=4)
-    measure_timeout_s: Positive = 15.0
-    two_face: bool = False
-    two_face_limit_mm: Positive = 0.5
-    drift_um_per_h: NonNegative = Field(default=50.0, description="station drift assumed since the last reference check")
+    protocol: Literal["line", "geocom"] = Field(description="line: the gateway's line protocol; geocom: GeoCOM ASCII")
+    port: str = Field(
+        min_length=1, description="any pyserial URL: /dev/ttyUSB0, socket://host:port, rfc2217://host:port"
+    )
+    baud: Annotated[int, Field(ge=1200, le=1_000_000)] = Field(default=115200, description="line speed, bit/s")
+    device_class: Literal["laser-tracker", "total-station"] = Field(description="whose noise model holds")
+    noise: Noise | None = Field(default=None, description="set only to override the noise of the device class")
+    station_pose: PoseVector = Field(description="approximate X_WT, mm and deg; refined from the ERS points")
+    ers: tuple[ErsPoint, ...] = Field(min_length=4, description="fixed reference points that define W")
+    measure_timeout_s: Positive = Field(default=15.0, description="longest time one point may take, s")
+    two_face: bool = Field(default=False, description="the instrument measures in both faces")
+    two_face_limit_mm: Positive = Field(
+        default=0.5, description="largest distance between the two faces' readings of a point, mm"
+    )
+    drift_um_per_h: NonNegative = Field(
+        default=50.0,
+        description="station drift assumed since the last reference check, um per hour, 1 sigma a coordinate",
+    )
 
 
 class CanBus(Model):
-    kind: Literal["canopen"]
-    interface: str = Field(description="python-can interface name")
-    channel: str
-    bitrate: Literal[125000, 250000, 500000, 1000000] = 1000000
-    cycle_s: Annotated[float, Field(ge=0.002, le=0.1)] = 0.01
-    heartbeat_s: Annotated[float, Field(ge=0.02, le=1.0)] = 0.1
-    drive_timeout_s: Annotated[float, Field(ge=0.05, le=2.0)] = 0.28
+    kind: Literal["canopen"] = Field(description="twelve or fewer CiA 402 drives in cyclic synchronous position mode")
+    interface: str = Field(description="python-can interface name, such as socketcan")
+    channel: str = Field(description="python-can channel, such as can0")
+    bitrate: Literal[125000, 250000, 500000, 1000000] = Field(default=1000000, description="bit/s")
+    cycle_s: Annotated[float, Field(ge=0.002, le=0.1)] = Field(default=0.01, description="SYNC period, s")
+    heartbeat_s: Annotated[float, Field(ge=0.02, le=1.0)] = Field(
+        default=0.1, description="heartbeat period of master and drives, s"
+    )
+    drive_timeout_s: Annotated[float, Field(ge=0.05, le=2.0)] = Field(
+        default=0.28, description="a drive stops by itself when the master's heartbeat is silent this long, s"
+    )
     map: str = Field(default="cia402", description="object map in drivers/maps")
-    counts_per_mm: Positive = 10000.0
+    counts_per_mm: Positive = Field(default=10000.0, description="position units of the drives in one mm")
 
 
 class ModbusBus(Model):
-    kind: Literal["modbus-tcp"]
-    segment_s: Annotated[float, Field(ge=0.02, le=0.5)] = 0.1
-    poll_s: Annotated[float, Field(ge=0.01, le=0.5)] = 0.05
-    timeout_s: Annotated[float, Field(ge=0.01, le=2.0)] = 0.05
-    watchdog_s: Annotated[float, Field(ge=0.05, le=2.0)] = 0.2
-    ramp_s: Annotated[float, Field(ge=0.05, le=5.0)] = Field(default=0.5, description="playback rate 1 -> 0 on hold or stop")
-    start_skew_s: NonNegative = Field(default=0.001, description="largest difference of the common start edge")
-    clock_ppm: NonNegative = Field(default=50.0, description="largest deviation of a controller's clock")
+    kind: Literal["modbus-tcp"] = Field(description="positioner PLCs with a segment queue and a common RUN line")
+    segment_s: Annotated[float, Field(ge=0.02, le=0.5)] = Field(
+        default=0.1, description="duration of one queued segment, s"
+    )
+    poll_s: Annotated[float, Field(ge=0.01, le=0.5)] = Field(default=0.05, description="period of the read-back, s")
+    timeout_s: Annotated[float, Field(ge=0.01, le=2.0)] = Field(
+        default=0.05, description="longest time one reply may take, s"
+    )
+    watchdog_s: Annotated[float, Field(ge=0.05, le=2.0)] = Field(
+        default=0.2, description="a PLC stops by itself when the host is silent this long, s"
+    )
+    ramp_s: Annotated[float, Field(ge=0.05, le=5.0)] = Field(
+        default=0.5, description="playback rate 1 -> 0 on hold or stop, s"
+    )
+    start_skew_s: NonNegative = Field(default=0.001, description="largest difference of the common start edge, s")
+    clock_ppm: NonNegative = Field(default=50.0, description="largest deviation of a controller's clock, ppm")
     map: str = Field(default="positioner_plc", description="register map in drivers/maps")
 
 
 class AxisConfig(Model):
-    name: Literal["X", "Y", "Z"]
+    name: Literal["X", "Y", "Z"] = Field(description="X, Y or Z; the axis is called positioner.axis")
     node: Annotated[int, Field(ge=1, le=127)] | None = Field(default=None, description="CANopen node id")
+    serial_number: Annotated[int, Field(ge=1, le=0xFFFF_FFFF)] | None = Field(
+        default=None, description="expected serial number of the drive (1018h:04); any when left out"
+    )
     direction: Vector3 = Field(description="real axis direction times scale, in W")
-    driven: bool = True
-    stroke_mm: tuple[Finite, Finite]
-    v_mm_s: Positive
-    a_mm_s2: Positive
-    j_mm_s3: Positive
-    a_quick_mm_s2: Positive
+    driven: bool = Field(default=True, description="false: follows without power, its encoder is read")
+    stroke_mm: tuple[Finite, Finite] = Field(description="lower and upper end, mm")
+    v_mm_s: Positive = Field(description="largest speed, mm/s")
+    a_mm_s2: Positive = Field(description="largest acceleration, mm/s^2")
+    j_mm_s3: Positive = Field(description="largest jerk, mm/s^3")
+    a_quick_mm_s2: Positive = Field(description="quick-stop deceleration, mm/s^2")
 
 
 class PositionerConfig(Model):
-    name: Name
-    origin_mm: Vector3 = Field(description="ball centre in W with all axes at zero, unloaded")
-    axes: tuple[AxisConfig, AxisConfig, AxisConfig]
-    stiffness_n_per_mm: tuple[Positive, Positive, Positive] = Field(description="along the axes, positioner with local structure")
-    rated_n: tuple[Positive, Positive, Positive]
-    swivel_deg: Positive = 15.0
+    name: Name = Field(description="such as A")
+    origin_mm: Vector3 = Field(description="ball centre in W with all axes at zero, unloaded, mm")
+    axes: tuple[AxisConfig, AxisConfig, AxisConfig] = Field(description="X, Y and Z, each once")
+    stiffness_n_per_mm: tuple[Positive, Positive, Positive] = Field(
+        description="along the axes, positioner with local structure, N/mm"
+    )
+    rated_n: tuple[Positive, Positive, Positive] = Field(description="largest load along each axis, N")
+    swivel_deg: Positive = Field(
+        default=15.0, description="largest turn of the ball in its socket from the docked attitude, deg"
+    )
     host: str | None = Field(default=None, description="Modbus TCP address")
-    port: Annotated[int, Field(ge=1, le=65535)] | None = None
-    unit: Annotated[int, Field(ge=1, le=247)] | None = None
-    load_cell: bool = False
+    port: Annotated[int, Field(ge=1, le=65535)] | None = Field(default=None, description="Modbus TCP port")
+    unit: Annotated[int, Field(ge=1, le=247)] | None = Field(default=None, description="Modbus unit id")
+    load_cell: bool = Field(default=False, description="a three-component load cell sits under the ball")
 
 
 class LoadCellConfig(Model):
-    range_n: tuple[Positive, Positive, Positive]
-    noise_n: Positive = 25.0
+    range_n: tuple[Positive, Positive, Positive] = Field(description="along X, Y, Z, N")
+    noise_n: Positive = Field(default=25.0, description="1 sigma, N")
 
 
 class SettleConfig(Model):
-    window_s: Positive = 1.0
-    readings: Annotated[int, Field(ge=2, le=20)] = 4
-    tolerance_mm: Positive = 0.005
-    timeout_s: Positive = 20.0
+    window_s: Positive = Field(default=1.0, description="wait after standstill before measuring, s")
+    readings: Annotated[int, Field(ge=2, le=20)] = Field(
+        default=4, description="consecutive stationary read-backs asked"
+    )
+    tolerance_mm: Positive = Field(default=0.005, description="largest movement between them, mm")
+    timeout_s: Positive = Field(default=20.0, description="longest wait for standstill, s")
 
 
 class LimitsConfig(Model):
-    following_error_rest_mm: Positive = 0.1
-    following_error_vmax_mm: Positive = 0.5
-    ball_residual_warn_mm: Positive = 0.05
-    ball_residual_mm: Positive = 0.1
-    internal_force_warn_n: Positive = 500.0
-    internal_force_n: Positive = 1500.0
-    warp_force_n: Positive = 300.0
-    reaction_min_fraction: Fraction = Field(default=0.1, description="of the equal share of the weight")
-    stroke_margin_mm: NonNegative = 2.0
-    first_correction_mm: Positive = 50.0
-    first_correction_deg: Positive = 2.0
-    station_correction_max_mm: Positive = 4.0
-    station_correction_min_mm: Positive = 0.5
-    station_correction_gap_fraction: Fraction = 0.2
+    following_error_rest_mm: Positive = Field(default=0.1, description="stop above it at rest, mm")
+    following_error_vmax_mm: Positive = Field(
+        default=0.5, description="stop above it at full axis speed, in proportion below, mm"
+    )
+    ball_residual_warn_mm: Positive = Field(
+        default=0.05, description="warn when the read-backs part from a rigid figure by more, mm"
+    )
+    ball_residual_mm: Positive = Field(default=0.1, description="stop when they part by more, mm")
+    internal_force_warn_n: Positive = Field(
+        default=500.0, description="warn above this predicted internal force at a ball, N"
+    )
+    internal_force_n: Positive = Field(default=1500.0, description="stop above it, N")
+    warp_force_n: Positive = Field(default=300.0, description="stop above this warp force of the vertical axes, N")
+    reaction_min_fraction: Fraction = Field(
+        default=0.1, description="least upward ball reaction, as a fraction of the equal share of the weight"
+    )
+    stroke_margin_mm: NonNegative = Field(default=2.0, description="kept free at both stroke ends, mm")
+    first_correction_mm: Positive = Field(default=50.0, description="largest shift of the first correction, mm")
+    first_correction_deg: Positive = Field(default=2.0, description="largest rotation of the first correction, deg")
+    station_correction_max_mm: Positive = Field(default=4.0, description="largest correction at any later station, mm")
+    station_correction_min_mm: Positive = Field(
+        default=0.5, description="correction always allowed at a later station, mm"
+    )
+    station_correction_gap_fraction: Fraction = Field(
+        default=0.2, description="between the two: this fraction of the gap to the mate"
+    )
     max_corrections: Annotated[int, Field(ge=1, le=20)] = Field(default=5, description="per stage")
-    frame_plausibility_mm: Positive = Field(default=0.5, description="measured pose against axis positions, largest ball")
-    fit_age_s: Positive = 300.0
-    target_residual_mm: Positive = Field(default=0.5, description="largest residual of a target in an accepted fit")
-    chord_error_mm: Positive = 0.02
-    missing_cycles: Annotated[int, Field(ge=1, le=100)] = 2
+    frame_plausibility_mm: Positive = Field(
+        default=0.5, description="measured pose against axis positions, largest ball, mm"
+    )
+    fit_age_s: Positive = Field(default=300.0, description="oldest fit that a move may rest on, s")
+    target_residual_mm: Positive = Field(default=0.5, description="largest residual of a target in an accepted fit, mm")
+    chord_error_mm: Positive = Field(
+        default=0.02, description="largest squeeze of the ball figure between two queued points, mm"
+    )
+    missing_cycles: Annotated[int, Field(ge=1, le=100)] = Field(
+        default=2, description="stop after so many cycles without a read-back"
+    )
     condition_max: Positive = Field(default=50.0, description="of the driven-axis Jacobian, rotations scaled")
-    rotation_length_mm: Positive = Field(default=3000.0, description="length that scales rotations")
+    rotation_length_mm: Positive = Field(
+        default=3000.0, description="length that scales rotations, about the arm of the balls, mm"
+    )
 
 
 class CellFile(Model):
     """A docking cell: instrument, positioners, bus, limits."""
 
-    schema_version: Literal[1]
-    name: Name
-    tracker: TrackerConfig
-    bus: CanBus | ModbusBus = Field(discriminator="kind")
-    positioners: tuple[PositionerConfig, ...] = Field(min_length=3)
-    load_cells: LoadCellConfig | None = None
-    gravity_direction: Vector3 = (0.0, 0.0, -1.0)
-    temperature_c: Finite = Field(default=20.0, description="reference temperature of all nominal coordinates")
-    limits: LimitsConfig = LimitsConfig()
-    settle: SettleConfig = SettleConfig()
+    schema_version: Literal[1] = Field(description="of this file format")
+    name: Name = Field(description="of the cell")
+    tracker: TrackerConfig = Field(description="the instrument")
+    bus: CanBus | ModbusBus = Field(discriminator="kind", description="the wire to the axes")
+    positioners: tuple[PositionerConfig, ...] = Field(min_length=3, description="in the order of all axis lists")
+    load_cells: LoadCellConfig | None = Field(
+        default=None, description="range and noise of the load cells, where positioners have them"
+    )
+    gravity_direction: Vector3 = Field(default=(0.0, 0.0, -1.0), description="unit vector in W")
+    temperature_c: Finite = Field(default=20.0, description="reference temperature of all nominal coordinates, deg C")
+    limits: LimitsConfig = Field(default=LimitsConfig(), description="where the cell stops or refuses")
+    settle: SettleConfig = Field(default=SettleConfig(), description="standstill before measuring")
     permissives: tuple[Name, ...] = Field(default=(), description="named inputs the cell offers")
 
     @property

@@ -3,10 +3,11 @@ its model still has these problems named in the same report; what is missing or 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator, Mapping
+from itertools import pairwise
 from typing import Any
 
+from docking.config.base import LARGEST
 from docking.config.findings import Finding, error, warning
 
 Document = Mapping[str, Any]
@@ -36,7 +37,7 @@ def numbers(doc: Any, path: str) -> list[tuple[str, float]]:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300 and math.isfinite(value)
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
 
 
 def duplicates(found: Iterable[Entry], what: str) -> list[Finding]:
@@ -185,7 +186,7 @@ def _stage_order(doc: Document) -> list[Finding]:
     found = numbers(doc, "stages[].standoff_mm")
     findings = [
         error(key, f"{value:g} mm must be below the stage before it ({before:g} mm)")
-        for (_, before), (key, value) in zip(found, found[1:], strict=False)
+        for (_, before), (key, value) in pairwise(found)
         if not value < before
     ]
     if found and len(found) == sum(1 for _ in entries(doc, "stages[]")) and found[-1][1] != 0.0:

@@ -84,14 +84,15 @@ def unknown_keys(error: ValidationError, doc: Mapping[str, Any]) -> tuple[Loc, .
 def without(doc: Any, locs: Sequence[Loc]) -> Any:
     """A copy of the document without the entries at `locs`."""
     here = {loc[0] for loc in locs if len(loc) == 1}
-    below = {loc[0] for loc in locs if len(loc) > 1}
+
+    def child(key: int | str, value: Any) -> Any:
+        below = [loc[1:] for loc in locs if loc[0] == key and len(loc) > 1]
+        return without(value, below) if below else value
+
     if isinstance(doc, Mapping):
-        items = ((k, v) for k, v in doc.items() if k not in here)
-        return {k: without(v, [p[1:] for p in locs if p[0] == k and len(p) > 1]) if k in below else v for k, v in items}
+        return {key: child(key, value) for key, value in doc.items() if key not in here}
     if isinstance(doc, tuple):
-        return tuple(
-            without(v, [p[1:] for p in locs if p[0] == i and len(p) > 1]) if i in below else v for i, v in enumerate(doc)
-        )
+        return tuple(child(i, value) for i, value in enumerate(doc))
     return doc
 
 
