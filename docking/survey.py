@@ -11,10 +11,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from docking.calibration.station import locate_station, reference_shift
+from docking.calibration.station import ReferenceShift, locate_station, reference_shift, to_world
 from docking.errors import DeviceSilent, StationMoved, TargetLost, TwoFaceDisagrees
 from docking.ports import Journal, Tracker
-from docking.pose import FitSettings, NoiseModel, fit_pose, screen
+from docking.pose import FitSettings, fit_pose, screen
+from docking.pose.passes import average_passes
 from docking.records import fit_record, station_record
 from docking.types import Array, Fit, Points, Pose, Reading
 
@@ -26,7 +27,6 @@ class SurveySettings:
     passes: int
     drift_points: int
     two_face_limit_mm: float
-    noise: NoiseModel
     station_fit: FitSettings
     mate_fit: FitSettings
     component_fit: FitSettings
@@ -58,7 +58,7 @@ class Survey:
     checked_at_s: float = float("nan")
     component: Points | None = None
     checks: Points | None = None
-    _reference_W_mm: dict[str, Array] = field(default_factory=dict)
+    _references: dict[str, Points] = field(default_factory=dict)
 
     async def locate(self, X_WT_guess: Pose, X_WM_guess: Pose) -> None:
         """Measure all ERS points and fit the station, then all mate targets and fit the mate."""
@@ -76,7 +76,7 @@ class Survey:
 
     async def measure_component(self, X_WC_guess: Pose, X_WM_guess: Pose, passes: int, *, more: bool = False) -> None:
         """Measure targets and check points in `passes` passes, then the references; again if the station moved."""
-        for _ in range(self.settings.attempts + 1):
+        for left in reversed(range(self.settings.attempts + 1)):
             targets = await self._measure_W("component", self.nominals.targets, X_WC_guess, passes)
             checks = await self._measure_W("check", self.nominals.checks, X_WC_guess, passes)
             moved = await self._check_references()
@@ -84,9 +84,10 @@ class Survey:
                 self.component = _joined(self.component, targets) if more and self.component else targets
                 self.checks = _joined(self.checks, checks) if more and self.checks else checks
                 return
+            if left == 0:
+                raise moved
             more = False
             await self.locate(self._station(), X_WM_guess)
-        raise moved
 
     def _station(self) -> Pose:
         if self.X_WT is None:
@@ -109,7 +110,7 @@ class Survey:
 
     async def _measure_W(self, group: str, nominal: Points, X_WN: Pose, passes: int) -> Points:
         X_WT = self._station()
-        return _placed(await self._shoot(group, nominal, X_WT, X_WN, passes), X_WT)
+        return to_world(X_WT, await self._shoot(group, nominal, X_WT, X_WN, passes))
 
     async def _shoot(self, group: str, nominal: Points, X_WT: Pose, X_WN: Pose, passes: int) -> Points:
         """All points of a group in T, pass after pass; a lost target is left out and the record says so."""
@@ -138,44 +139,61 @@ class Survey:
                     raise
         return None
 
+    def check_points(self) -> tuple[Points, Points]:
+        """(nominal in C, measured in W) check points, passes averaged; those whose passes disagree are left out."""
+        nominal = self.nominals.checks
+        if self.checks is None or not len(self.checks):
+            return _picked(nominal, []), Points((), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        seen = _averaged(self.checks, self.settings.component_fit)
+        return _picked(nominal, [nominal.names.index(n) for n in seen.names]), seen
+
     def _keep_references(self, ers: Points, mate: Points) -> None:
-        X_WT = self._station()
-        placed = _placed(ers, X_WT)
-        self._reference_W_mm = {**_means(placed), **_means(mate)}
+        """Where the references read when the station was located: their change is movement, whatever their nominal."""
+        self._references = {
+            "ers": _averaged(to_world(self._station(), ers), self.settings.station_fit),
+            "mate": _averaged(mate, self.settings.mate_fit),
+        }
 
     async def _check_references(self) -> StationMoved | None:
-        """Re-measure some ERS points and mate targets; the shift that is more than noise, if there is one."""
-        X_WT, X_WM = self._station(), self.X_WM
-        for reference, nominal, X in (
-            ("ers", self.nominals.ers, Pose.identity()),
-            ("mate", self.nominals.mate, X_WM.X_MN if X_WM else Pose.identity()),
-        ):
-            chosen = _spread(nominal, self._reference_W_mm, self.settings.drift_points)
-            again = await self._shoot("drift", chosen, X_WT, X, self.settings.passes)
-            shift, limit = reference_shift(
-                self._reference_W_mm, _placed(again, X_WT), self.settings.passes, self.settings.drift_sigmas
-            )
-            moved = not (shift <= limit)
-            body = {"reference": reference, "shift_mm": shift, "limit_mm": limit, "restationed": moved}
+        """Re-measure some ERS points and mate targets; the shift that is more than noise, if there is one.
+
+        A shift has to show twice: one badly seated reflector is no reason to locate the station again.
+        """
+        mate = self.X_WM.X_MN if self.X_WM is not None else Pose.identity()
+        for group, nominal, X_WN in (("ers", self.nominals.ers, Pose.identity()), ("mate", self.nominals.mate, mate)):
+            for _ in range(2):
+                shift = await self._shift(group, nominal, X_WN)
+                if not shift.moved:
+                    break
+            body = {
+                "reference": group,
+                "shift_mm": shift.worst_mm,
+                "limit_mm": shift.limit_mm,
+                "restationed": shift.moved,
+            }
             self.journal.write("drift", body)
-            if moved:
-                return StationMoved(reference, "measured again against the references", value=shift, limit=limit)
+            if shift.moved:
+                return StationMoved(group, "seen against the references", value=shift.worst_mm, limit=shift.limit_mm)
         self.checked_at_s = self.clock()
         return None
 
+    async def _shift(self, group: str, nominal: Points, X_WN: Pose) -> ReferenceShift:
+        known = self._references[group]
+        rows = [i for i, name in enumerate(nominal.names) if name in known.names]
+        count = min(self.settings.drift_points, len(rows))
+        chosen = _picked(nominal, [rows[round(k)] for k in np.linspace(0, len(rows) - 1, count)])
+        again = await self._shoot("drift", chosen, self._station(), X_WN, self.settings.passes)
+        return reference_shift(self._station(), known, again, self.settings.drift_sigmas)
 
-def _spread(nominal: Points, known: dict[str, Array], count: int) -> Points:
-    """`count` of the points that were measured before, evenly through their list."""
-    index = [i for i, name in enumerate(nominal.names) if name in known]
-    picked = [index[round(k)] for k in np.linspace(0, len(index) - 1, min(count, len(index)))]
-    names = tuple(nominal.names[i] for i in picked)
-    return Points(names, nominal.xyz_mm[picked], nominal.cov_mm2[picked])
+
+def _picked(points: Points, rows: list[int]) -> Points:
+    return Points(tuple(points.names[i] for i in rows), points.xyz_mm[rows], points.cov_mm2[rows])
 
 
-def _placed(points: Points, X_WT: Pose) -> Points:
-    """Points of the station in W; the covariance is the instrument's alone."""
-    cov = X_WT.R @ points.cov_mm2 @ X_WT.R.T if len(points) else points.cov_mm2
-    return Points(points.names, X_WT.apply(points.xyz_mm), cov, points.passes)
+def _averaged(points: Points, settings: FitSettings) -> Points:
+    averaged = average_passes(points, settings)
+    xyz = np.array(averaged.xyz_mm).reshape(-1, 3)
+    return Points(tuple(averaged.names), xyz, np.array(averaged.cov_mm2).reshape(-1, 3, 3))
 
 
 def _points(rows: list[tuple[Reading, int]]) -> Points:
@@ -195,13 +213,6 @@ def _joined(first: Points, more: Points) -> Points:
         np.concatenate([first.cov_mm2, more.cov_mm2]),
         first.passes + tuple(p + last for p in more.passes),
     )
-
-
-def _means(points: Points) -> dict[str, Array]:
-    """Median of the passes of each point: one gross reading among three or more does not move it."""
-    names = dict.fromkeys(points.names)
-    rows = {n: [x for m, x in zip(points.names, points.xyz_mm, strict=True) if m == n] for n in names}
-    return {n: np.median(np.array(x), axis=0) for n, x in rows.items()}
 
 
 def _row(reading: Reading, run: int) -> dict[str, object]:

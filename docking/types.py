@@ -302,7 +302,7 @@ class Trace:
 
 @dataclass(frozen=True, eq=False)
 class MoveResult:
-    """How a move ended: `done`, `stopped` (on request, on the path) or `fault` (with the cause in `alarm`).
+    """How a move ended: `done`, `stopped` (on request, on the path) or `fault` (with its `cause`).
 
     `path_time_s` is where on the plan it ended, `commanded_mm` (m,) the last commanded axis positions.
     """
@@ -314,7 +314,7 @@ class MoveResult:
     max_following_error_mm: Array
     max_residual_mm: float
     max_internal_force_n: float
-    alarm: Alarm | None = None
+    cause: Exception | None = None
 
 
 @dataclass(frozen=True)

@@ -60,9 +60,7 @@ class Watch:
 
     def watch_about(self, q_mm: Array) -> None:
         """Linearise the coupling check about the socket figure at `q_mm` (m,)."""
-        self._coupling = coupling_monitor(
-            self._positioners, socket_positions(self._positioners, q_mm), self._up
-        )
+        self._coupling = coupling_monitor(self._positioners, socket_positions(self._positioners, q_mm), self._up)
 
     def evaluate(self, feedback: Feedback, q_ref_mm: Array, speed_mm_s: Array | float) -> MotionError | None:
         """The first violated limit, or None. `q_ref_mm` (m,) is the rigid figure the read-back belongs to."""

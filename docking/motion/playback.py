@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
+from docking.planning import position_at
 from docking.types import Array, Plan
+
+ROW_S = 1e-9
+"""Path times nearer than this to a row are that row: rounding of the sum of cycles, far below any clock."""
 
 
 class Playback:
     """Reads a plan's table at path time tau, d(tau)/dt = rate in 0..1.
 
     A change of the rate takes 1.5 |change| / slew seconds along a cubic, so ds/dt is smooth and its largest slope is
-    the plan's `rate_slew_per_s`. Between two rows the set-point is interpolated linearly; the rows are so close
-    that the chord stays inside the plan's stated chord error.
+    the plan's `rate_slew_per_s`. At full rate the rows themselves are the set-points; between rows, as a hold leaves
+    it, the plan's own interpolation keeps the part rigid.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -51,16 +55,20 @@ class Playback:
 
     def setpoint_at(self, path_time_s: float) -> Array:
         """The set-point (m,) at a path time; clamped to the ends of the table."""
-        position = path_time_s / self._period
-        row = int(position)
+        row = round(path_time_s / self._period)
         if row >= self._last:
             end: Array = self._q[self._last]
             return end
-        fraction = position - row
-        if fraction < 1e-9:
+        if abs(path_time_s - row * self._period) < ROW_S:
             exact: Array = self._q[row]
             return exact
-        between: Array = self._q[row] + fraction * (self._q[row + 1] - self._q[row])
+        return position_at(self.plan, path_time_s)
+
+    def chord_at(self, path_time_s: float) -> Array:
+        """Where devices that interpolate each axis linearly between rows stand (m,) at a path time."""
+        position = min(max(path_time_s / self._period, 0.0), float(self._last))
+        row = min(int(position), self._last - 1)
+        between: Array = self._q[row] + (position - row) * (self._q[row + 1] - self._q[row])
         return between
 
     def speed_at(self, path_time_s: float) -> Array:

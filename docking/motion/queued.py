@@ -97,7 +97,7 @@ class QueuedMotion:
             cause = self._watch.evaluate(feedback, self._commanded, 0.0)
         else:
             at = feedback.path_time_s
-            cause = self._watch.evaluate(feedback, playback.setpoint_at(max(at, 0.0)), playback.speed_at(at))
+            cause = self._watch.evaluate(feedback, playback.chord_at(at), playback.speed_at(at))
         if cause is not None and self._cause is None:
             self._cause = cause
             if self._moving:
@@ -114,11 +114,9 @@ class QueuedMotion:
         return stop_asked
 
     def _result(self, outcome: str, playback: Playback, recorder: Recorder) -> MoveResult:
-        now = asyncio.get_running_loop().time()
         path_time = self.feedback().path_time_s
-        self._commanded = playback.setpoint_at(path_time) if path_time >= 0.0 else self._commanded
-        alarm = self._cause.alarm(now) if self._cause else None
-        return recorder.result(outcome, path_time, self._commanded, alarm)
+        self._commanded = playback.chord_at(path_time) if path_time >= 0.0 else self._commanded
+        return recorder.result(outcome, path_time, self._commanded, self._cause)
 
     async def _keep_alive(self) -> None:
         while True:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from docking.motion.monitors import Watch
-from docking.types import Alarm, Array, Feedback, MoveResult, Trace
+from docking.types import Array, Feedback, MoveResult, Trace
 
 
 class Recorder:
@@ -33,7 +33,7 @@ class Recorder:
             )
         self._count += 1
 
-    def result(self, outcome: str, path_time_s: float, commanded_mm: Array, alarm: Alarm | None) -> MoveResult:
+    def result(self, outcome: str, path_time_s: float, commanded_mm: Array, cause: Exception | None) -> MoveResult:
         """The finished move."""
         watch = self._watch
         columns = [np.array(column, dtype=np.float64) for column in zip(*self._rows, strict=True)] or [
@@ -47,5 +47,5 @@ class Recorder:
             max_following_error_mm=watch.max_following_mm,
             max_residual_mm=watch.max_residual_mm,
             max_internal_force_n=watch.max_internal_force_n,
-            alarm=alarm,
+            cause=cause,
         )

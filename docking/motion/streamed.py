@@ -147,8 +147,7 @@ class StreamedMotion:
         if not (playback.at_end or stopped):
             return
         outcome = "fault" if self._cause else "stopped" if stopped else "done"
-        alarm = self._cause.alarm(feedback.t_s) if self._cause else None
-        result = move.recorder.result(outcome, playback.path_time_s, self._setpoint, alarm)
+        result = move.recorder.result(outcome, playback.path_time_s, self._setpoint, self._cause)
         self._move = None
         if not move.done.done():
             move.done.set_result(result)

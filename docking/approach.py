@@ -1,0 +1,73 @@
+"""Where the component should be at each station, and how far its docking features are from there.
+
+The features' goal is the mate's features; a station's goal stands its stand-off back along the docking axis. Errors are
+always component minus goal in W, judged with the uncertainty of both sides (design rule 11 of the acceptance: every
+e + 2 sigma inside its tolerance, ISO 14253-1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from docking.planning import Attempt, ConvergenceSettings, Verdict, attempt, correction_to, decide
+from docking.pose import Budget, Features, feature_errors, goal_pose
+from docking.types import Array, Correction, FeatureErrors, Fit
+
+
+@dataclass(frozen=True)
+class Station:
+    """One stage of the approach."""
+
+    name: str
+    standoff_mm: float
+    speed_mm_s: float
+    permissives: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Approach:
+    """The geometry of one docking: feature pairs, docking axis in M (3,), docking face in C (3,), the stations.
+
+    `component_expansion`, `mate_expansion`: 1 sigma of the expansion (1/K times K) that temperature leaves open.
+    """
+
+    features: Features
+    component_expansion: float
+    mate_expansion: float
+    axis_M: Array
+    face_C_mm: Array
+    stations: tuple[Station, ...]
+    convergence: ConvergenceSettings
+
+    def errors(self, X_WC: Fit, X_WM: Fit, station: Station, drift_sigma_mm: float) -> FeatureErrors:
+        """Component features minus their places at `station` (f, 3) in W, with the whole uncertainty."""
+        budget = Budget(drift_sigma_mm, self.component_expansion, self.mate_expansion)
+        errors = feature_errors(X_WC, X_WM, self.features, budget)
+        back = station.standoff_mm * self._axis_W(X_WM)
+        return FeatureErrors(errors.names, errors.error_mm + back, errors.sigma_mm, errors.tolerance_mm)
+
+    def correction(self, X_WC: Fit, X_WM: Fit, station: Station) -> Correction:
+        """The move from the measured pose to the goal at `station`, about the docking face: the features on the mate's,
+        then back along the docking axis by the stand-off."""
+        goal = goal_pose(X_WC, X_WM, self.features, -station.standoff_mm * self._axis_W(X_WM))
+        return correction_to(X_WC.X_MN, goal, self.face_C_mm)
+
+    def close_enough_mm(self, station: Station) -> float:
+        """At a station before contact: the deviation with which the approach may go on, 2 % of the gap, 0.5 mm at most,
+        never less than the dead-band."""
+        tolerance = float(np.min(self.features.tolerance_mm))
+        dead_band = min(self.convergence.dead_band_mm, self.convergence.dead_band_fraction * tolerance)
+        return max(dead_band, min(0.5, 0.02 * station.standoff_mm))
+
+    def verdict(self, history: list[Attempt], station: Station) -> Verdict:
+        """What to do at the last station: accept, move, measure more, or give up."""
+        return decide(history, self.convergence, station.name)
+
+    def look(self, errors: FeatureErrors, corrections: int, passes: int) -> Attempt:
+        return attempt(errors, corrections, passes)
+
+    def _axis_W(self, X_WM: Fit) -> Array:
+        axis: Array = X_WM.X_MN.R @ (self.axis_M / np.linalg.norm(self.axis_M))
+        return axis

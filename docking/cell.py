@@ -1,0 +1,77 @@
+"""The one orchestrating loop: events in, `step()`, effects out."""
+
+from __future__ import annotations
+
+import asyncio
+
+from docking.errors import DockingError, EventRefused
+from docking.procedure import Procedure
+from docking.state import FINAL, Effect, Event, Situation, State, step
+
+OPENING = {State.STANDBY: Event.CONNECT, State.DISABLED: Event.ENABLE, State.IDLE: Event.START_SEATED}
+"""What `dock` asks for by itself until the first measurement."""
+
+REQUESTS = {Effect.HOLD: "hold", Effect.RESUME: "resume", Effect.STOP: "stop"}
+"""Effects that only tell the running move something."""
+
+
+class Cell:
+    """A docking cell. `dock()` runs one docking to one of the final states; `post()` takes the operator's events."""
+
+    def __init__(self, procedure: Procedure) -> None:
+        self.procedure = procedure
+        self.situation = Situation()
+        self._events: asyncio.Queue[tuple[Event, DockingError | None]] = asyncio.Queue()
+        self._activity: asyncio.Task[None] | None = None
+
+    def post(self, event: Event) -> None:
+        """An event from the operator; one that the table refuses is told and changes nothing."""
+        self._events.put_nowait((event, None))
+
+    async def dock(self) -> State:
+        """Run from OFFLINE to a final state and release the devices."""
+        self.post(Event.LOAD)
+        asked: set[State] = set()
+        try:
+            while self.situation.state not in FINAL:
+                self._handle(*await self._events.get())
+                state = self.situation.state
+                if state in OPENING and state not in asked:
+                    asked.add(state)
+                    self.post(OPENING[state])
+        finally:
+            if self._activity is not None and not self._activity.done():
+                self._activity.cancel()
+                await asyncio.gather(self._activity, return_exceptions=True)
+            await self.procedure.close()
+        return self.situation.state
+
+    def _handle(self, event: Event, error: DockingError | None) -> None:
+        before = self.situation.state
+        try:
+            self.situation, effects = step(self.situation, event, error.text() if error else None)
+        except EventRefused as refusal:
+            self.procedure.operator.notify(refusal.text())
+            return
+        body = {"from": before.value, "event": event.value, "to": self.situation.state.value}
+        self.procedure.journal.write("state", body)
+        if error is not None:
+            self.procedure.alarm(error)
+        for effect in effects:
+            self._begin(effect)
+
+    def _begin(self, effect: Effect) -> None:
+        verb = REQUESTS.get(effect)
+        if verb is None:
+            self._activity = asyncio.get_running_loop().create_task(self._perform(effect))
+            return
+        self.procedure.journal.write("command", {"verb": verb})
+        self.procedure.motion.request(verb)
+
+    async def _perform(self, effect: Effect) -> None:
+        error: DockingError | None = None
+        try:
+            event = await self.procedure.effects[effect]()
+        except DockingError as raised:
+            event, error = Event.FAULTED, raised
+        self._events.put_nowait((event, error))

@@ -1,0 +1,305 @@
+"""What the cell does in each state: one coroutine an effect, each answering with an event.
+
+Every measurement, fit, plan, confirmation, intent and result goes to the journal here; an intent is durable before
+the first frame of its move leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+
+from docking import records
+from docking.approach import Approach, Station
+from docking.errors import (
+    DockingError,
+    FitResidual,
+    FrameImplausible,
+    PermissiveMissing,
+    PlanError,
+    PlanStale,
+)
+from docking.kinematics import Positioners, figure_residual_mm, pose_from_axes
+from docking.motion.settle import SettleSettings, settle
+from docking.planning import Action, Attempt, GuardSettings, PlanRequest, PlanSettings, check_correction, make_plan
+from docking.ports import Journal, Motion, Operator
+from docking.pose import check_points_agree, fit_pose, screen
+from docking.state import Effect, Event
+from docking.survey import Survey
+from docking.types import Alarm, Array, FeatureErrors, Fit, Plan, Pose
+
+
+@dataclass(frozen=True, eq=False)
+class ProcedureSettings:
+    """What the procedure needs of the files, besides the stages' own settings."""
+
+    positioners: Positioners
+    plan: PlanSettings
+    guard: GuardSettings
+    settle: SettleSettings
+    X_WT: Pose
+    X_WM: Pose
+    period_s: float
+    linear_interpolation: bool
+    drift_mm_per_s: float
+    target_residual_mm: float
+    rms_limit_mm: float | None
+    plausibility_mm: float
+    fit_age_s: float
+
+
+@dataclass
+class Progress:
+    """Where a docking stands."""
+
+    stage: int = 0
+    corrections: int = 0
+    passes: int = 0
+    moves: int = 0
+    commanded_mm: Array | None = None
+    X_WC: Fit | None = None
+    fitted_at_s: float = float("nan")
+    errors: FeatureErrors | None = None
+    plan: Plan | None = None
+    kind: str = "align"
+    history: list[Attempt] = field(default_factory=list)
+    alarms: list[Alarm] = field(default_factory=list)
+    rejected: set[str] = field(default_factory=set)
+    max_residual_mm: float = 0.0
+    max_internal_force_n: float = 0.0
+
+
+class Procedure:
+    """The effects of the state table, and what is known while a docking runs."""
+
+    def __init__(
+        self,
+        settings: ProcedureSettings,
+        approach: Approach,
+        survey: Survey,
+        motion: Motion,
+        journal: Journal,
+        operator: Operator,
+    ) -> None:
+        self._settings, self._approach, self._survey = settings, approach, survey
+        self.motion, self.journal, self.operator = motion, journal, operator
+        self.progress = Progress()
+        self.effects: dict[Effect, Callable[[], Awaitable[Event]]] = {
+            Effect.CONNECT: self._connect,
+            Effect.ENABLE: self._enable,
+            Effect.LOCATE: self._locate,
+            Effect.MEASURE: self._measure,
+            Effect.FIT: self._fit,
+            Effect.JUDGE: self._judge,
+            Effect.PLAN: self._plan,
+            Effect.ASK: self._ask,
+            Effect.MOVE: self._move,
+            Effect.SETTLE: self._settle,
+        }
+
+    def alarm(self, error: DockingError) -> None:
+        """Keep an error in the journal and tell the operator."""
+        alarm = error.alarm(self._survey.clock())
+        self.progress.alarms.append(alarm)
+        self.journal.write("alarm", records.alarm_record(alarm))
+        self.operator.notify(f"{alarm.code}: {error.text()}")
+
+    async def close(self) -> None:
+        """Release the devices; what goes wrong is told, and the rest is still released."""
+        for close in (self.motion.close, self._survey.tracker.close):
+            try:
+                await close()
+            except DockingError as error:
+                self.alarm(error)
+
+    async def _connect(self) -> Event:
+        found = (await self._survey.tracker.connect(), *await self.motion.connect())
+        for identity in found:
+            self.journal.write("identity", vars(identity))
+        self.operator.notify(f"{len(found)} devices answer")
+        return Event.CONNECTED
+
+    async def _enable(self) -> Event:
+        self.progress.commanded_mm = await self.motion.enable()
+        return Event.ENABLED
+
+    async def _locate(self) -> Event:
+        await self._survey.locate(self._settings.X_WT, self._settings.X_WM)
+        station = _known(self._survey.X_WT, "station")
+        self.operator.notify(f"station located from {len(station.names)} references, rms {station.rms_mm:.3f} mm")
+        return Event.FRAME_MEASURED
+
+    async def _measure(self) -> Event:
+        p = self.progress
+        more = p.passes > 0
+        passes = self._survey.settings.passes
+        guess = pose_from_axes(self._settings.positioners, self._commanded())
+        await self._survey.measure_component(guess, self._settings.X_WM, passes, more=more)
+        p.passes = passes if not more else p.passes + passes
+        return Event.MEASURED
+
+    async def _fit(self) -> Event:
+        p, survey, settings = self.progress, self._survey, self._survey.settings.component_fit
+        fit = fit_pose(screen(survey.nominals.targets, _known(survey.component, "component"), settings), settings)
+        self.journal.write("fit", records.fit_record(fit, "component", self._station().name))
+        p.rejected |= {r.name for r in fit.rejected}
+        if not (fit.max_mm <= self._settings.target_residual_mm):
+            worst = fit.names[int(np.argmax(np.linalg.norm(fit.residuals_mm, axis=1)))]
+            raise FitResidual(worst, value=fit.max_mm, limit=self._settings.target_residual_mm)
+        if self._settings.rms_limit_mm is not None and not (fit.rms_mm <= self._settings.rms_limit_mm):
+            raise FitResidual("rms", value=fit.rms_mm, limit=self._settings.rms_limit_mm)
+        self._check_against_axes(fit)
+        p.X_WC, p.fitted_at_s = fit, survey.clock()
+        return Event.FITTED
+
+    def _check_against_axes(self, fit: Fit) -> None:
+        """The fitted pose must put the balls where the axes say the sockets are; catches swapped axes and frames."""
+        gaps = np.linalg.norm(
+            figure_residual_mm(self._settings.positioners, self.motion.feedback().position_mm, fit.X_MN), axis=1
+        )
+        worst = int(np.argmax(gaps))
+        if not (gaps[worst] <= self._settings.plausibility_mm):
+            where = f"ball {self._settings.positioners.names[worst]}"
+            raise FrameImplausible(where, value=float(gaps[worst]), limit=self._settings.plausibility_mm)
+
+    async def _judge(self) -> Event:
+        p, station = self.progress, self._station()
+        fit, mate = self._component_fit(), self._mate_fit()
+        errors = self._approach.errors(fit, mate, station, self._drift_sigma_mm())
+        p.errors = errors
+        when = "before" if p.moves == 0 else "after"
+        p.history.append(self._approach.look(errors, p.corrections, p.passes))
+        self.journal.write("features", records.features_record(errors, station.name, when))
+        i = errors.worst()
+        self.operator.notify(
+            f"{station.name}: {errors.names[i]} is off by {errors.norm_mm[i]:.3f} mm "
+            f"(sigma {errors.sigma_mm[i]:.3f}, tolerance {errors.tolerance_mm[i]:.3f})"
+        )
+        self._check_check_points(fit)
+        if station is self._approach.stations[-1]:
+            return self._judge_contact(station)
+        if float(np.max(errors.norm_mm)) <= self._approach.close_enough_mm(station):
+            p.stage, p.corrections, p.kind, p.history = p.stage + 1, 0, "approach", []
+            return Event.MOVE_NEEDED
+        return self._correct(station)
+
+    def _judge_contact(self, station: Station) -> Event:
+        verdict = self._approach.verdict(self.progress.history, station)
+        if verdict.action is Action.DONE:
+            errors = self.progress.errors
+            if errors is not None:
+                self.journal.write("features", records.features_record(errors, station.name, "final"))
+            return Event.ACCEPTED
+        if verdict.action is Action.MEASURE_MORE:
+            return Event.MEASURE_MORE
+        if verdict.action is Action.MOVE:
+            return self._correct(station)
+        if verdict.action is Action.OUT_OF_TOLERANCE and verdict.error is not None:
+            self.alarm(verdict.error)
+            return Event.NOT_ACCEPTED
+        raise verdict.error or PlanError(station.name, verdict.reason)
+
+    def _correct(self, station: Station) -> Event:
+        """Ask for a correction at this station, inside the guard."""
+        p = self.progress
+        correction = self._approach.correction(self._component_fit(), self._mate_fit(), station)
+        check_correction(correction, self._settings.guard, station.name, None if p.moves == 0 else station.standoff_mm)
+        if p.corrections >= self._approach.convergence.max_corrections:
+            verdict = self._approach.verdict(p.history, station)
+            raise verdict.error or PlanError(station.name, verdict.reason)
+        p.corrections, p.kind = p.corrections + 1, "align"
+        return Event.MOVE_NEEDED
+
+    def _check_check_points(self, fit: Fit) -> None:
+        """Points kept out of the fit must lie where the fit says; they see what the fit's own residuals cannot."""
+        nominal, seen = self._survey.check_points()
+        if not len(seen):
+            return
+        off = check_points_agree(fit, nominal, seen)
+        errors = np.linalg.norm(off, axis=1).tolist()
+        self.journal.write("check_points", {"names": list(seen.names), "error_mm": errors, "limit_mm": None})
+
+    async def _plan(self) -> Event:
+        p, station = self.progress, self._station()
+        correction = self._approach.correction(self._component_fit(), self._mate_fit(), station)
+        request = PlanRequest(
+            plan_id=p.moves + 1,
+            stage=station.name,
+            kind=p.kind,
+            q_now_mm=self._commanded(),
+            correction=correction,
+            speed_mm_s=station.speed_mm_s,
+            period_s=self._settings.period_s,
+            linear_interpolation=self._settings.linear_interpolation,
+        )
+        p.plan = make_plan(request, self._settings.positioners, self._settings.plan)
+        self.journal.write("plan", records.plan_record(p.plan))
+        return Event.PLANNED
+
+    async def _ask(self) -> Event:
+        p, plan = self.progress, self._planned()
+        missing = await self.operator.permissives(self._station().permissives)
+        if missing:
+            raise PermissiveMissing(missing[0], value=self._station().name)
+        shown = records.features_record(p.errors, plan.stage, "before") if p.errors else {}
+        go = await self.operator.confirm(plan, shown)
+        self.journal.write("confirm", {"plan_hash": plan.plan_hash, "go": go})
+        return Event.CONFIRMED if go else Event.DECLINED
+
+    async def _move(self) -> Event:
+        p, plan = self.progress, self._planned()
+        age = self._survey.clock() - p.fitted_at_s
+        if not (age <= self._settings.fit_age_s):
+            raise PlanStale(plan.stage, f"its fit is {age:.0f} s old, at most {self._settings.fit_age_s:.0f} s")
+        self.journal.write("intent", records.intent_record(plan), durable=True)
+        await self.motion.load(plan)
+        self.operator.notify(
+            f"moving: {plan.kind} {plan.stage}, {plan.duration_s:.0f} s, limited by {plan.speed_limited_by}"
+        )
+        result = await self.motion.start(plan.plan_hash)
+        p.moves, p.passes = p.moves + 1, 0
+        p.commanded_mm = result.commanded_mm
+        p.max_residual_mm = max(p.max_residual_mm, result.max_residual_mm)
+        p.max_internal_force_n = max(p.max_internal_force_n, result.max_internal_force_n)
+        self.journal.write("moved", records.moved_record(plan, result))
+        if result.cause is not None:
+            raise result.cause
+        return Event.MOVED if result.result == "done" else Event.STOPPED
+
+    async def _settle(self) -> Event:
+        rest_s = await settle(self.motion, self._settings.settle)
+        self.journal.write("settled", {"t_s": rest_s})
+        return Event.SETTLED
+
+    # what is known ---------------------------------------------------------------------------------------------
+    def _station(self) -> Station:
+        return self._approach.stations[self.progress.stage]
+
+    def _commanded(self) -> Array:
+        return _known(self.progress.commanded_mm, "commanded axis positions")
+
+    def _planned(self) -> Plan:
+        return _known(self.progress.plan, "plan")
+
+    def _component_fit(self) -> Fit:
+        return _known(self.progress.X_WC, "pose of the component")
+
+    def _mate_fit(self) -> Fit:
+        return _known(self._survey.X_WM, "pose of the mate")
+
+    def _drift_sigma_mm(self) -> float:
+        """Drift of the station assumed since the references were last checked."""
+        return self._settings.drift_mm_per_s * max(0.0, self._survey.clock() - self._survey.checked_at_s)
+
+
+T = TypeVar("T")
+
+
+def _known(value: T | None, what: str) -> T:
+    """`value`, which the state table has made sure is there; PlanStale names it if it is not."""
+    if value is None:
+        raise PlanStale(what, "it is not known in this state")
+    return value
