@@ -63,8 +63,8 @@ def fit_files(nominal_path: str | Path, measured_path: str | Path, method: str =
     """Screen and fit MEASURED to NOMINAL; the JSON object of `docking fit`.
 
     `pose` is X_MN (nominal into measured coordinates); `residuals_mm` measured minus fitted, passes averaged;
-    `used` and `rejected` name the points; `dropped_readings` are single passes left out of a used point; `refused` is the reason
-    why no pose is given, else null. Raises FileUnreadable, BadPointFile, BadArgument.
+    `used` and `rejected` name the points; `dropped_readings` are single passes left out of a used point; `refused`
+    is the reason why no pose is given, else null. Raises FileUnreadable, BadPointFile, BadArgument.
     """
     if method not in METHODS:
         raise BadArgument("--method", f"choose one of {', '.join(METHODS)}", value=method)

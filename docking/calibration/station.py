@@ -9,6 +9,7 @@ from scipy.stats import chi2, norm
 
 from docking.errors import SigmaMissing, TooFewPoints
 from docking.pose import FitSettings, fit_pose, screen
+from docking.pose.passes import mean_reading
 from docking.pose.uncertainty import largest_sigma_mm
 from docking.types import Array, Fit, Points, Pose, Screened
 
@@ -55,21 +56,30 @@ def reference_shift(X_WT: Pose, reference: Points, readings: Points, sigmas: flo
     """Test whether reference points (ERS or mate targets) still read as they did when the station was located.
 
     `reference` (W): their places then, best `to_world(X_WT, first readings)`, so that errors of nominal values cancel;
-    `readings` (T): one row a point now. Two tests, each at the two-sided probability of `sigmas` (3: 0.27 %): the
+    `readings` (T): now, in one or more passes, of which ALL count: a reading that disagrees is a sign, not noise. Two tests, each at the two-sided probability of `sigmas` (3: 0.27 %): the
     common shift (all points together) and each single point. Not measurable counts as moved: a NaN fails both.
     Raises TooFewPoints under three common points, SigmaMissing where a covariance is not known.
     """
     rows = {name: i for i, name in enumerate(reference.names)}
-    common = [(rows[name], i) for i, name in enumerate(readings.names) if name in rows]
-    if not (len({r for r, _ in common}) >= MIN_REFERENCES):
+    common = [(rows[name], i) for i, name in enumerate(dict.fromkeys(readings.names)) if name in rows]
+    if not (len(common) >= MIN_REFERENCES):
         raise TooFewPoints("reference points", value=len(common), limit=MIN_REFERENCES)
     before, now = [r for r, _ in common], [i for _, i in common]
-    world = to_world(X_WT, readings)
+    world = to_world(X_WT, _averaged(readings))
     shift = world.xyz_mm[now] - reference.xyz_mm[before]
     cov = world.cov_mm2[now] + reference.cov_mm2[before]
     if not bool(np.all(np.isfinite(cov))):
         raise SigmaMissing("reference points", value="a reading")
-    return _verdict(tuple(readings.names[i] for i in now), shift, cov, 2.0 * float(norm.sf(sigmas)))
+    return _verdict(tuple(world.names[i] for i in now), shift, cov, 2.0 * float(norm.sf(sigmas)))
+
+
+def _averaged(readings: Points) -> Points:
+    """One row a name, in the order of first appearance."""
+    names = np.array(readings.names)
+    order = tuple(dict.fromkeys(readings.names))
+    means = [mean_reading(readings.xyz_mm[names == n], readings.cov_mm2[names == n]) for n in order]
+    xyz, cov = (np.array([m[k] for m in means]) for k in (0, 1))
+    return Points(order, xyz.reshape(-1, 3), cov.reshape(-1, 3, 3))
 
 
 def _verdict(names: tuple[str, ...], shift: Array, cov: Array, probability: float) -> ReferenceShift:

@@ -8,6 +8,7 @@ from docking.pose.features import Budget, Features, check_points_agree, feature_
 from docking.pose.fit import fit_pose
 from docking.pose.layout import Spread, check_layout, spread
 from docking.pose.noise import LASER_TRACKER, NOISE_PRESETS, TOTAL_STATION, NoiseModel
+from docking.pose.passes import Averaged, average_passes
 from docking.pose.screening import screen
 from docking.pose.settings import METHODS, FitSettings, Method
 
@@ -16,12 +17,14 @@ __all__ = [
     "METHODS",
     "NOISE_PRESETS",
     "TOTAL_STATION",
+    "Averaged",
     "Budget",
     "Features",
     "FitSettings",
     "Method",
     "NoiseModel",
     "Spread",
+    "average_passes",
     "check_layout",
     "check_points_agree",
     "feature_errors",

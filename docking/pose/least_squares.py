@@ -20,7 +20,8 @@ _MAX_ITERATIONS = 60
 
 
 class Solution(NamedTuple):
-    """Pose X_MN, iterations used, covariance (7, 7) of [rotation, translation, expansion] about the pivot, expansion."""
+    """Pose X_MN, iterations used, covariance (7, 7) of [rotation, translation, expansion] about the pivot, and
+    the fitted expansion."""
 
     X_MN: Pose
     iterations: int

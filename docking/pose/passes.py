@@ -93,7 +93,7 @@ def _moved_between(tables: list[tuple[Array, Array]], scatter_mm: float) -> floa
     return 2.0 * max(shift) if rigid and all(rigid) and max(shift) > 4.0 * scatter_mm else None
 
 
-def _mean(xyz: Array, cov: Array) -> tuple[Array, Array]:
+def mean_reading(xyz: Array, cov: Array) -> tuple[Array, Array]:
     """Mean of readings (m, 3), weighted by their covariances where these are known; with its covariance (or NaN)."""
     if not bool(np.all(np.isfinite(cov))):
         return xyz.mean(axis=0), np.full((3, 3), np.nan)
@@ -153,7 +153,7 @@ def _settle(result: Averaged, name: str, readings: _Readings, test: tuple[float,
             Rejection(name, "passes-disagree", f"readings {spread:.3f} mm apart, no majority among {len(keep)}")
         )
         return
-    mean, mean_cov = _mean(xyz[keep], cov[keep])
+    mean, mean_cov = mean_reading(xyz[keep], cov[keep])
     for k in np.flatnonzero(~keep):
         off = float(np.linalg.norm(xyz[k] - mean))
         result.dropped.append(
