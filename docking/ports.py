@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from docking.state import Event
 from docking.types import Array, Feedback, Identity, MoveResult, Plan, Reading
 
 
@@ -124,6 +125,10 @@ class Journal(Protocol):
 
 class Operator(Protocol):
     """Who confirms. Dry-run confirms by itself; the terminal asks a person."""
+
+    def attend(self, post: Callable[[Event], None]) -> None:
+        """Begin: `post` takes the operator's hold, resume and abort at any time."""
+        ...
 
     async def confirm(self, plan: Plan, shown: dict[str, Any]) -> bool:
         """Show the deviation and every axis displacement; True = go, False = abort."""

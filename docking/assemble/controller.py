@@ -1,0 +1,170 @@
+"""The controller of a cell: settings from the files, drivers on the given wires, the loop on top."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from docking.approach import Approach, Station
+from docking.cell import Cell
+from docking.config import CellFile, JobFile
+from docking.config.build import (
+    convergence_settings,
+    gravity_m_s2,
+    guard_settings,
+    plan_period_s,
+    plan_settings,
+    positioners_from,
+)
+from docking.config.budget import noise_of
+from docking.config.cell import ModbusBus
+from docking.config.nominal import ers_points, feature_points, mate_feature_points, target_points
+from docking.geometry import pose_from_vector
+from docking.kinematics import Positioners
+from docking.motion import QueuedMotion, StreamedMotion
+from docking.motion.monitors import Watch, WatchLimits
+from docking.motion.settle import SettleSettings
+from docking.ports import CanLink, Journal, Motion, Operator, SerialLink, Tracker
+from docking.pose import Features, FitSettings
+from docking.procedure import Procedure, ProcedureSettings
+from docking.survey import Nominals, Survey, SurveySettings
+from docking.types import Array
+from drivers.canopen.positioners import CanopenPositioners
+from drivers.geocom_tracker import GeocomTracker
+from drivers.line_tracker import LineTracker
+from drivers.modbus_positioners import ModbusPositioners
+
+AGREEING_POINTS = 4
+"""Points that must agree before the cell believes a fit: three have nothing left to prove them wrong."""
+
+
+@dataclass(frozen=True)
+class Wires:
+    """The near ends of a cell's wires: a serial line, and a CAN bus or the addresses of the positioner PLCs."""
+
+    serial: SerialLink
+    can: CanLink | None = None
+    modbus: dict[str, tuple[str, int]] | None = None
+
+
+@dataclass(frozen=True)
+class Company:
+    """Who a run works with: the journal, the operator, and the clock of the loop."""
+
+    journal: Journal
+    operator: Operator
+    clock: Callable[[], float]
+
+
+def build_cell(cell: CellFile, job: JobFile, wires: Wires, company: Company) -> Cell:
+    """The whole controller of one docking."""
+    positioners = positioners_from(cell, job)
+    motion = _motion(cell, positioners, wires)
+    survey = Survey(
+        tracker=_tracker(cell, wires.serial),
+        journal=company.journal,
+        nominals=_nominals(cell, job),
+        settings=_survey_settings(cell, job),
+        clock=company.clock,
+    )
+    settings = _procedure_settings(cell, job, positioners)
+    approach = _approach(cell, job)
+    return Cell(Procedure(settings, approach, survey, motion, company.journal, company.operator))
+
+
+def _tracker(cell: CellFile, link: SerialLink) -> Tracker:
+    noise = noise_of(cell)
+
+    def covariance(p_T_mm: Array) -> Array:
+        one: Array = noise.covariance(p_T_mm)[0]
+        return one
+
+    driver = {"line": LineTracker, "geocom": GeocomTracker}[cell.tracker.protocol]
+    return driver(link, cell.tracker, covariance)
+
+
+def _motion(cell: CellFile, positioners: Positioners, wires: Wires) -> Motion:
+    limits = cell.limits
+    gravity = gravity_m_s2(cell)
+    watch_limits = WatchLimits(
+        following_rest_mm=limits.following_error_rest_mm,
+        following_vmax_mm=limits.following_error_vmax_mm,
+        ball_residual_mm=limits.ball_residual_mm,
+        internal_force_n=limits.internal_force_n,
+        warp_force_n=limits.warp_force_n,
+        missing_cycles=limits.missing_cycles,
+    )
+    watch = Watch(positioners, -gravity / np.linalg.norm(gravity), watch_limits)
+    if isinstance(cell.bus, ModbusBus):
+        return QueuedMotion(ModbusPositioners(cell, wires.modbus), watch, cell.bus.poll_s)
+    if wires.can is None:
+        raise ValueError("a CANopen cell needs the near end of its bus")
+    return StreamedMotion(CanopenPositioners(cell, wires.can), watch)
+
+
+def _nominals(cell: CellFile, job: JobFile) -> Nominals:
+    part, mate = job.component, job.mate
+    return Nominals(
+        ers=ers_points(cell.tracker.ers),
+        mate=target_points(mate.targets, mate, cell),
+        targets=target_points(part.targets, part, cell),
+        checks=target_points(part.check_points, part, cell),
+    )
+
+
+def _survey_settings(cell: CellFile, job: JobFile) -> SurveySettings:
+    part, mate = job.component, job.mate
+
+    def fit(where: str, expansion_sigma: float = 0.0) -> FitSettings:
+        return FitSettings(where=where, min_agreeing=AGREEING_POINTS, expansion_sigma=expansion_sigma)
+
+    return SurveySettings(
+        passes=job.measuring.passes,
+        drift_points=job.measuring.drift_points,
+        two_face_limit_mm=cell.tracker.two_face_limit_mm,
+        station_fit=fit("station"),
+        mate_fit=fit("mate", mate.expansion_per_k * mate.temperature_sigma_k),
+        component_fit=fit("component", part.expansion_per_k * part.temperature_sigma_k),
+    )
+
+
+def _procedure_settings(cell: CellFile, job: JobFile, positioners: Positioners) -> ProcedureSettings:
+    settle, limits = cell.settle, cell.limits
+    return ProcedureSettings(
+        positioners=positioners,
+        plan=plan_settings(cell, job),
+        guard=guard_settings(cell),
+        settle=SettleSettings(settle.window_s, settle.readings, settle.tolerance_mm, settle.timeout_s),
+        X_WT=pose_from_vector(cell.tracker.station_pose),
+        X_WM=pose_from_vector(job.mate.pose),
+        period_s=plan_period_s(cell),
+        linear_interpolation=isinstance(cell.bus, ModbusBus),
+        drift_mm_per_s=cell.tracker.drift_um_per_h * 1e-3 / 3600.0,
+        target_residual_mm=limits.target_residual_mm,
+        rms_limit_mm=job.rms_limit_mm,
+        plausibility_mm=limits.frame_plausibility_mm,
+        fit_age_s=limits.fit_age_s,
+    )
+
+
+def _approach(cell: CellFile, job: JobFile) -> Approach:
+    part, mate = job.component, job.mate
+    features = Features(
+        names=tuple(f.name for f in part.features),
+        component_mm=feature_points(part, cell).xyz_mm,
+        mate_mm=mate_feature_points(part, mate, cell).xyz_mm,
+        component_sigma_mm=np.array([f.sigma_mm for f in part.features]),
+        mate_sigma_mm=np.array([f.mate_sigma_mm for f in part.features]),
+        tolerance_mm=np.array([f.tolerance_mm for f in part.features]),
+    )
+    return Approach(
+        features=features,
+        component_expansion=part.expansion_per_k * part.temperature_sigma_k,
+        mate_expansion=mate.expansion_per_k * mate.temperature_sigma_k,
+        axis_M=np.array(job.docking_axis),
+        face_C_mm=np.array(part.docking_face_mm),
+        stations=tuple(Station(s.name, s.standoff_mm, s.speed_mm_s, s.permissives) for s in job.stages),
+        convergence=convergence_settings(cell, job),
+    )

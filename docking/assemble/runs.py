@@ -1,0 +1,275 @@
+"""One run from files to summary: in virtual time, or on real wires."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from docking.assemble.controller import Company, Wires, build_cell
+from docking.assemble.simulated import FarEnd, make_far_end, real_wires, truth_of, virtual_wires
+from docking.cell import Cell
+from docking.config import CellFile, JobFile
+from docking.config.load import default_job_path, file_sha256, load_cell, load_job
+from docking.errors import BadArgument, FileUnreadable
+from docking.journal import JournalFile, read
+from docking.operators import AutomaticOperator, TerminalOperator
+from docking.ports import Operator
+from docking.procedure import Progress
+from docking.records import alarm_record
+from docking.state import State
+from docking.version import VERSION
+from drivers.links.can_bus import CanBusLink
+from drivers.links.serial_port import SerialPort
+from sim.truth import TruthFile
+from sim.virtual_time import run_virtual
+
+OUTCOMES = {
+    State.DOCKED: "docked",
+    State.OUT_OF_TOLERANCE: "out_of_tolerance",
+    State.RECOVER: "stopped",
+    State.FAULT: "fault",
+}
+DECISION_RULE = "e + 2 sigma <= tolerance for every docking feature (ISO 14253-1, k = 2)"
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """What one run is asked to do: files, seed of the simulation, where report and journal go, language."""
+
+    cell_path: Path
+    job_path: Path | None
+    seed: int
+    report: Path | None
+    journal: Path | None
+    language: str
+
+
+@dataclass(frozen=True)
+class WireChoice:
+    """Which wires: simulated ones (`sim`), at the addresses in `wires` or started for this run."""
+
+    sim: bool
+    wires: Path | None
+
+
+@dataclass(frozen=True)
+class Files:
+    """The loaded files of a run."""
+
+    cell: CellFile
+    job: JobFile
+    job_path: Path
+
+
+def load_files(request: RunRequest) -> Files:
+    """Load and check both files; raises ConfigError with all problems."""
+    cell = load_cell(request.cell_path)
+    job_path = request.job_path or default_job_path(request.cell_path)
+    return Files(cell, load_job(job_path, cell), job_path)
+
+
+def dry_run(request: RunRequest, say: Say) -> dict[str, Any]:
+    """Dock in virtual time; returns the summary, writes journal and report."""
+    files = load_files(request)
+    truth = truth_of(request.cell_path)
+    return dry_run_files(files, truth, request, say)
+
+
+def dry_run_files(files: Files, truth: TruthFile, request: RunRequest, say: Say) -> dict[str, Any]:
+    """`dry_run` with files already loaded and a truth of the caller's choice (studies)."""
+    with ExitStack() as stack:
+        path = _journal_path(request, stack)
+
+        async def main() -> dict[str, Any]:
+            far = make_far_end(files.cell, files.job, truth, request.seed)
+            wires = await virtual_wires(files.cell, far)
+            operator = AutomaticOperator(say)
+            return await _dock(_Run(files, request, wires, operator, path, far, simulated=True))
+
+        summary = run_virtual(main)
+        return _finish(request, path, summary)
+
+
+def run_on_wires(request: RunRequest, choice: WireChoice, say: Say, *, step: bool) -> dict[str, Any]:
+    """Dock over real wires; with `step` a person confirms every move in the terminal."""
+    files = load_files(request)
+    with ExitStack() as stack:
+        path = _journal_path(request, stack)
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="docking-")))
+
+        async def main() -> dict[str, Any]:
+            far = None
+            if choice.sim and choice.wires is None:
+                far = make_far_end(files.cell, files.job, truth_of(request.cell_path), request.seed)
+                found = await real_wires(files.cell, far, folder)
+            else:
+                found = _read_wires(choice.wires, files.cell) if choice.wires else {}
+            operator = TerminalOperator(say, request.language) if step else AutomaticOperator(say)
+            wires = near_ends(files.cell, found)
+            try:
+                return await _dock(_Run(files, request, wires, operator, path, far, simulated=choice.sim))
+            finally:
+                if far is not None:
+                    await far.close()
+
+        return _finish(request, path, asyncio.run(main()))
+
+
+def serve(request: RunRequest, wires_file: Path | None, say: Say) -> None:
+    """Serve the simulated devices of a cell on real wires until interrupted."""
+    files = load_files(request)
+    with tempfile.TemporaryDirectory(prefix="docking-sim-") as folder:
+
+        async def main() -> None:
+            far = make_far_end(files.cell, files.job, truth_of(request.cell_path), request.seed)
+            found = await real_wires(files.cell, far, Path(folder))
+            text = json.dumps(found, indent=2)
+            if wires_file is not None:
+                # Written whole and then renamed: a reader never meets half a file.
+                part = wires_file.with_suffix(".part")
+                part.write_text(text + "\n", "utf-8")
+                part.replace(wires_file)
+            say(text)
+            say("simulated devices are served; end with Ctrl-C")
+            try:
+                await asyncio.Event().wait()
+            finally:
+                await far.close()
+
+        asyncio.run(main())
+
+
+def near_ends(cell: CellFile, found: dict[str, Any]) -> Wires:
+    """The near ends of real wires: at the addresses of simulated devices in `found`, else those of the cell file."""
+    serial = SerialPort(found.get("tracker", cell.tracker.port), cell.tracker.baud)
+    if cell.bus.kind == "modbus-tcp":
+        listed = found.get("modbus")
+        return Wires(serial, modbus={n: (str(h), int(p)) for n, (h, p) in listed.items()} if listed else None)
+    if "can" in found:
+        return Wires(serial, can=CanBusLink("docking-unix", found["can"], cell.bus.bitrate))
+    return Wires(serial, can=CanBusLink(cell.bus.interface, cell.bus.channel, cell.bus.bitrate))
+
+
+@dataclass(frozen=True)
+class _Run:
+    files: Files
+    request: RunRequest
+    wires: Wires
+    operator: Operator
+    journal_path: Path
+    far: FarEnd | None
+    simulated: bool
+
+
+async def _dock(run: _Run) -> dict[str, Any]:
+    """Dock once on the running loop and close the journal with the outcome."""
+    loop = asyncio.get_running_loop()
+    started_s, wall_s = loop.time(), time.perf_counter()
+    journal = JournalFile(run.journal_path, loop.time)
+    try:
+        journal.write("run_started", _started(run), durable=True)
+        cell = build_cell(run.files.cell, run.files.job, run.wires, Company(journal, run.operator, loop.time))
+        run.operator.attend(cell.post)
+        state = await cell.dock()
+        times = (loop.time() - started_s, time.perf_counter() - wall_s)
+        summary = _summary(run, cell, state, times)
+        journal.write("outcome", summary, durable=True)
+        return summary
+    finally:
+        journal.close()
+
+
+def _started(run: _Run) -> dict[str, Any]:
+    files, limits = run.files, run.files.cell.limits
+    return {
+        "cell": str(run.request.cell_path),
+        "job": str(files.job_path),
+        "cell_sha256": file_sha256(run.request.cell_path),
+        "job_sha256": file_sha256(files.job_path),
+        "part_number": files.job.part_number,
+        "serial_number": files.job.serial_number,
+        "seed": run.request.seed if run.simulated else None,
+        "simulated": run.simulated,
+        "version": VERSION,
+        "tolerance_mm": files.job.tolerance_mm,
+        "decision_rule": DECISION_RULE,
+        "axes": list(files.cell.axis_names),
+        "limits": {
+            "following_error_mm": limits.following_error_vmax_mm,
+            "ball_residual_mm": limits.ball_residual_mm,
+            "internal_force_n": limits.internal_force_n,
+        },
+    }
+
+
+def _summary(run: _Run, cell: Cell, state: State, times_s: tuple[float, float]) -> dict[str, Any]:
+    """The object that `--json` prints."""
+    p: Progress = cell.procedure.progress
+    outcome = OUTCOMES[state]
+    if outcome == "fault" and p.moves == 0:
+        outcome = "refused"
+    worst = p.errors.worst() if p.errors is not None else None
+    true_mm = float(run.far.plant.true_feature_errors_mm().max()) if run.far is not None else None
+    return {
+        "outcome": outcome,
+        "tolerance_mm": run.files.job.tolerance_mm,
+        "max_feature_error_mm": float(p.errors.norm_mm[worst]) if p.errors is not None else None,
+        "feature_sigma_mm": float(p.errors.sigma_mm[worst]) if p.errors is not None else None,
+        "true_max_feature_error_mm": true_mm,
+        "moves": p.moves,
+        "rejected_points": sorted(p.rejected),
+        "max_consistency_residual_mm": p.max_residual_mm if p.moves else None,
+        "max_internal_force_n": p.max_internal_force_n if p.moves else None,
+        "virtual_time_s": times_s[0],
+        "wall_time_s": times_s[1],
+        "alarms": [alarm_record(a) for a in p.alarms],
+        "report": str(run.request.report) if run.request.report else None,
+    }
+
+
+def _finish(request: RunRequest, journal_path: Path, summary: dict[str, Any]) -> dict[str, Any]:
+    """Write the report from the journal alone."""
+    if request.report is not None:
+        from docking.report import write_report
+
+        request.report.parent.mkdir(parents=True, exist_ok=True)
+        write_report(read(journal_path), request.report, request.language)
+    return summary
+
+
+def _journal_path(request: RunRequest, stack: ExitStack) -> Path:
+    """Where the journal of this run goes: as asked, beside the report, or into a folder that ends with the run."""
+    if request.journal is not None:
+        return _fresh(request.journal)
+    if request.report is not None:
+        return _fresh(request.report.with_suffix(".journal.jsonl"))
+    return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="docking-"))) / "journal.jsonl"
+
+
+def _fresh(path: Path) -> Path:
+    """One journal a run: an earlier one is kept beside it under the next free number."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.exists():
+        n = 1
+        while (kept := path.with_name(f"{path.stem}.{n}{path.suffix}")).exists():
+            n += 1
+        path.rename(kept)
+    return path
+
+
+def _read_wires(path: Path, cell: CellFile) -> dict[str, Any]:
+    try:
+        found: dict[str, Any] = json.loads(path.read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise FileUnreadable(str(path), str(error)) from error
+    if not isinstance(found, dict) or found.get("cell") != cell.name:
+        raise BadArgument("--wires", f"the file is not for cell {cell.name}", value=str(path))
+    return found

@@ -1,0 +1,105 @@
+"""The simulated far end of a cell: one plant, its instrument and its positioners, on virtual or on real wires."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from docking.assemble.controller import Wires
+from docking.config import CellFile, JobFile
+from docking.config.cell import CanBus, ModbusBus
+from sim.canopen.group import DriveGroup
+from sim.instrument import Instrument
+from sim.plant import Plant
+from sim.plc.group import PlcGroup
+from sim.tracker.geocom import GeocomStation
+from sim.tracker.line import LineTrackerDevice
+from sim.truth import TruthFile, load_truth
+from sim.wires.can_frames import CanEnd
+from sim.wires.pacing import DeviceEnd
+from sim.wires.pty_serial import PtySerial
+from sim.wires.unix_can import UnixCanServer
+from sim.wires.virtual_can import VirtualCan
+from sim.wires.virtual_serial import VirtualSerial
+
+
+def truth_path(cell_path: Path) -> Path:
+    """`NAME.sim.toml` beside `NAME.toml`."""
+    return cell_path.with_name(cell_path.name.removesuffix(".toml") + ".sim.toml")
+
+
+def truth_of(cell_path: Path) -> TruthFile:
+    """The plant's truth of a simulated cell; the controller never reads it."""
+    return load_truth(truth_path(cell_path))
+
+
+@dataclass
+class FarEnd:
+    """The simulated devices of one cell. `plant` is the truth; `devices` are held so that they live."""
+
+    plant: Plant
+    instrument: Instrument
+    loop: asyncio.AbstractEventLoop
+    seed: int
+    devices: list[Any] = field(default_factory=list)
+
+    def tracker(self, cell: CellFile, wire: DeviceEnd) -> None:
+        """Put the instrument on a serial wire."""
+        device = {"line": LineTrackerDevice, "geocom": GeocomStation}[cell.tracker.protocol]
+        self.devices.append(device(self.instrument, wire, self.loop, self.seed))
+
+    def drives(self, cell: CellFile, wire: CanEnd) -> None:
+        """Put the drives on a CAN bus."""
+        self.devices.append(DriveGroup(self.plant, cell, wire, self.loop))
+
+    async def plcs(self, cell: CellFile, addresses: dict[str, tuple[str, int]] | None) -> dict[str, tuple[str, int]]:
+        """Let the positioner PLCs listen; return their addresses."""
+        group = PlcGroup(self.plant, cell, [self.plant.clock_ppm[p.name] for p in cell.positioners], self.loop)
+        self.devices.append(group)
+        return await group.serve(addresses)
+
+    async def close(self) -> None:
+        """Stop the devices."""
+        for device in self.devices:
+            close = getattr(device, "close", None)
+            result = close() if close is not None else None
+            if asyncio.iscoroutine(result):
+                await result
+
+
+def make_far_end(cell: CellFile, job: JobFile, truth: TruthFile, seed: int) -> FarEnd:
+    """Plant and instrument of one seed; call on the loop that will run them."""
+    plant = Plant(cell, job, truth, seed)
+    return FarEnd(plant, Instrument(plant, cell, truth, seed), asyncio.get_running_loop(), seed)
+
+
+async def virtual_wires(cell: CellFile, far: FarEnd) -> Wires:
+    """All devices on wires inside the process; returns the near ends."""
+    serial = VirtualSerial(far.loop, cell.tracker.baud)
+    far.tracker(cell, serial.far)
+    if isinstance(cell.bus, CanBus):
+        bus = VirtualCan(far.loop, cell.bus.bitrate)
+        far.drives(cell, bus.end())
+        return Wires(serial.near, can=bus.end())
+    return Wires(serial.near, modbus=await far.plcs(cell, None))
+
+
+async def real_wires(cell: CellFile, far: FarEnd, folder: Path) -> dict[str, Any]:
+    """All devices on real wires (pty, AF_UNIX CAN, loopback TCP); returns their addresses as plain data."""
+    serial = PtySerial(far.loop, cell.tracker.baud)
+    serial.open()
+    far.tracker(cell, serial)
+    far.devices.append(serial)
+    found: dict[str, Any] = {"cell": cell.name, "tracker": serial.path}
+    if isinstance(cell.bus, ModbusBus):
+        addresses = {p.name: ("127.0.0.1", 0) for p in cell.positioners}
+        found["modbus"] = {name: list(at) for name, at in (await far.plcs(cell, addresses)).items()}
+        return found
+    bus = UnixCanServer(far.loop, folder / "can.sock", cell.bus.bitrate)
+    await bus.open()
+    far.drives(cell, bus)
+    far.devices.append(bus)
+    found["can"] = str(bus.path)
+    return found
