@@ -23,6 +23,8 @@ def pose_from_axes(positioners: Positioners, q_mm: ArrayLike, rows: NDArray[np.b
     """
     used = np.ones(len(positioners.axes), dtype=np.bool_) if rows is None else rows
     sockets = socket_positions(positioners, q_mm)
+    if not np.all(np.isfinite(sockets)):
+        raise FrameImplausible("axis positions", "They are not all numbers.", value=float("nan"), limit=_STEP_MM)
     R = positioners.neutral_R_WC
     t = sockets.mean(axis=0) - R @ positioners.balls_C_mm.mean(axis=0)
     length = float(np.sqrt(np.mean(np.sum(positioners.balls_C_mm**2, axis=1)))) or 1.0
@@ -33,7 +35,7 @@ def pose_from_axes(positioners: Positioners, q_mm: ArrayLike, rows: NDArray[np.b
         jac[:, 3:] /= length
         gap = axis_displacements(positioners, sockets - balls)[used]
         step, _, rank, _ = np.linalg.lstsq(jac, gap, rcond=1e-9)
-        if rank < 6 or not np.all(np.isfinite(step)):
+        if rank < 6:
             break
         t = t + step[:3]
         R = exp_so3(step[3:] / length) @ R

@@ -5,6 +5,7 @@ Along the path `q' = g s'`, `q'' = g s'' + h s'^2`, `q''' = g s''' + 3 h s' s'' 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from math import ceil, sqrt
 
@@ -21,6 +22,9 @@ _SAMPLES = 256
 _GUARD = 1.0002
 """Stretch that covers what peaks between two samples of the law."""
 _LEAST_PERIODS = 4
+_NEARLY = 0.98
+"""A limit this near to the strictest is named before it when it stands earlier in the list: speeds first."""
+_DIVISIONS = (1.0, 0.6, 0.3, 0.15)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,18 +69,16 @@ class PaceLimits:
         """(factor, limit) by which `law` must be stretched (shrunk below 1) to just meet each limit."""
         motion = motion_along(path, law)
         axes, share = self.positioners, self.settings.acceleration_share
-        ratios = {
-            "speed": motion.speed.max(axis=0) / axes.v_mm_s,
-            "acceleration": np.sqrt(motion.acceleration.max(axis=0) / (share * axes.a_mm_s2)),
-            "jerk": np.cbrt(motion.jerk.max(axis=0) / axes.j_mm_s3),
-        }
+        skew = self._skew(motion, law)
+        found = [(motion.point_speed / self.speed_mm_s, "stage speed"), (skew, "start skew of the bus")]
+        ratios = {"speed": motion.speed.max(axis=0) / axes.v_mm_s}
         if self.settings.playback_ramp_s > 0.0:
             ratios["stopping"] = self._stopping(motion)
-        found = [(float(r.max()), f"{axes.axes[int(r.argmax())]} {what}") for what, r in ratios.items()]
-        found.append((motion.point_speed / self.speed_mm_s, "stage speed"))
+        ratios["acceleration"] = np.sqrt(motion.acceleration.max(axis=0) / (share * axes.a_mm_s2))
+        ratios["jerk"] = np.cbrt(motion.jerk.max(axis=0) / axes.j_mm_s3)
+        found += [(float(r.max()), f"{axes.axes[int(r.argmax())]} {what}") for what, r in ratios.items()]
         if self.linear:
             found.append((self._chord(path, motion), "chord error of the interpolation"))
-        found.append((self._skew(motion, law), "start skew and clock drift of the bus"))
         return found
 
     def _stopping(self, motion: Motion) -> Array:
@@ -109,30 +111,35 @@ def fastest_law(path: RigidPath, limits: PaceLimits) -> tuple[TimeLaw, str]:
     """
     if path.travel_mm <= 0.0:
         return quintic(_LEAST_PERIODS * limits.period_s), "standstill"
-    best, reason = quintic(), ""
-    for number, law in enumerate((quintic(), _s_curve_for(path, limits))):
-        factor, name = max(limits.stretches(path, law))
-        duration = law.duration_s * factor * _GUARD
-        if number == 0 or duration < best.duration_s:
-            best, reason = law.stretched_to(duration), name
+    stretched = []
+    for law in (quintic(), *_s_curves_for(path, limits)):
+        found = limits.stretches(path, law)
+        factor = max(found)[0]
+        reason = next(name for ratio, name in found if ratio >= _NEARLY * factor)
+        stretched.append((law.stretched_to(law.duration_s * factor * _GUARD), reason))
+    best, reason = min(stretched, key=lambda pair: pair[0].duration_s)
     periods = max(_LEAST_PERIODS, ceil(best.duration_s / limits.period_s - 1e-9))
     if periods == _LEAST_PERIODS:
         reason = "period of the bus"
     return best.stretched_to(periods * limits.period_s), reason
 
 
-def _s_curve_for(path: RigidPath, limits: PaceLimits) -> TimeLaw:
-    """Seven-segment law whose shape suits the limits projected on s; its exact duration follows from its stretches."""
-    axes, share = limits.positioners, limits.settings.acceleration_share
+def _s_curves_for(path: RigidPath, limits: PaceLimits) -> Iterator[TimeLaw]:
+    """Seven-segment laws whose shapes suit the limits projected on s; exact durations follow from their stretches.
+
+    Where the devices' own ramp needs acceleration too, several divisions between path and ramp are tried.
+    """
+    axes, ramp_s = limits.positioners, limits.settings.playback_ramp_s
     g, h = (np.maximum(path.axis_bounds(order), 1e-12) for order in (1, 2))
-    samples = path.point_speed_mm(np.linspace(0.0, 1.0, 17))
-    usable = share * axes.a_mm_s2
-    turning = np.sqrt(0.25 * usable / h)
-    v = min(float(np.min(axes.v_mm_s / g)), limits.speed_mm_s / float(samples.max()), float(np.min(turning)))
-    a = float(np.min((usable - h * v**2) / g))
-    if limits.settings.playback_ramp_s > 0.0:
-        v = min(v, limits.settings.playback_ramp_s * float(np.min((axes.a_mm_s2 - usable) / g)))
-    return s_curve(v, a, float(np.min(axes.j_mm_s3 / g)))
+    point_speed = float(path.point_speed_mm(np.linspace(0.0, 1.0, 17)).max())
+    j = float(np.min(axes.j_mm_s3 / g))
+    for part in (1.0,) if ramp_s == 0.0 else _DIVISIONS:
+        usable = part * limits.settings.acceleration_share * axes.a_mm_s2
+        bounds = [axes.v_mm_s / g, np.sqrt(0.25 * usable / h)]
+        if ramp_s > 0.0:
+            bounds.append(ramp_s * (axes.a_mm_s2 - usable) / g)
+        v = min(limits.speed_mm_s / point_speed, *(float(np.min(bound)) for bound in bounds))
+        yield s_curve(v, float(np.min((usable - h * v**2) / g)), j)
 
 
 def rate_slew_per_s(path: RigidPath, law: TimeLaw, limits: PaceLimits) -> float:

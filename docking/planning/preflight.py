@@ -99,7 +99,7 @@ def check_table(s: Array, q_mm: Array, period_s: float, positioners: Positioners
     )
     for order, (what, limit) in enumerate(limits):
         rows = (rows[:, 1:] - rows[:, :-1]) / period_s
-        peak = np.maximum(rows.max(axis=1), -rows.min(axis=1))
+        peak = np.abs(np.maximum(rows.max(axis=1), -rows.min(axis=1)))
         if order == 0:
             peak_speed = peak
         k = int(np.argmax(np.where(np.isnan(peak), np.inf, peak / limit)))
