@@ -1,0 +1,192 @@
+"""The tracker line protocol as bytes: framing, checksum and grammar (docs/line-protocol.md). Pure; no I/O, no clock.
+
+    $<TYPE>,<seq>,<fields>*<CRC-16/ARC, 4 upper-case hex digits>\\r\\n
+
+Nothing is guessed: a line that departs from the grammar in one character is counted and dropped. Numbers are decimal
+integers in micrometres and microseconds, so NaN, infinity, exponents and decimal commas cannot be written at all.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+LINE_MAX = 200
+SEQ_MODULUS = 65536
+
+VALID, DEGRADED, OCCLUDED, CHANGED, FACE_2 = 1, 2, 4, 8, 16
+FLAG_MASK = 31
+
+
+def _crc_table() -> tuple[int, ...]:
+    table = []
+    for byte in range(256):
+        value = byte
+        for _ in range(8):
+            value = (value >> 1) ^ 0xA001 if value & 1 else value >> 1
+        table.append(value)
+    return tuple(table)
+
+
+_TABLE = _crc_table()
+
+
+def crc16_arc(data: bytes) -> int:
+    """CRC-16/ARC: polynomial 0x8005 reflected, start 0, no final xor; 0xBB3D over b"123456789"."""
+    crc = 0
+    for byte in data:
+        crc = (crc >> 8) ^ _TABLE[(crc ^ byte) & 0xFF]
+    return crc
+
+
+def encode(kind: str, seq: int, *fields: str | int) -> bytes:
+    """One line of the host; ValueError when it would break the grammar."""
+    body = ",".join((kind, str(seq), *map(str, fields)))
+    if not _BODY.fullmatch(body):
+        raise ValueError(f"not a line of the protocol: {body!r}")
+    raw = body.encode("ascii")
+    line = b"$%b*%04X\r\n" % (raw, crc16_arc(raw))
+    if len(line) > LINE_MAX:
+        raise ValueError(f"line of {len(line)} bytes, limit {LINE_MAX}")
+    return line
+
+
+@dataclass(frozen=True)
+class PointLine:
+    """`$PNT`: coordinates and their standard deviations in whole micrometres, frame of the station."""
+
+    seq: int
+    t_us: int
+    target: str
+    xyz_um: tuple[int, int, int]
+    sigma_um: tuple[int, int, int]
+    flags: int
+
+
+@dataclass(frozen=True)
+class RefusalLine:
+    """`$ERR`: the device cannot do what was asked."""
+
+    seq: int
+    code: int
+    words: str
+
+
+@dataclass(frozen=True)
+class AckLine:
+    """`$ACK`: done, nothing to report."""
+
+    seq: int
+
+
+@dataclass(frozen=True)
+class HeartbeatLine:
+    """`$HBT`: the device is alive; `state` is 0 idle, 1 measuring, 2 not ready. `seq` is the device's own counter."""
+
+    seq: int
+    t_us: int
+    state: int
+
+
+@dataclass(frozen=True)
+class IdentityLine:
+    """`$IDN`: answer to `$VER`; `protocol` is the version of this protocol that the device speaks."""
+
+    seq: int
+    protocol: int
+    vendor: str
+    product: str
+    serial: str
+    firmware: str
+
+
+Reply = PointLine | RefusalLine | AckLine | HeartbeatLine | IdentityLine
+
+_BODY = re.compile(r"[A-Z]{3},(?:0|[1-9][0-9]{0,4})(?:,[ -#%-)+\-./0-9:-~]*)*")
+_UINT = r"(0|[1-9][0-9]{0,17})"
+_INT = r"(0|-?[1-9][0-9]{0,8})"
+_NAME = r"([A-Za-z0-9][A-Za-z0-9_.\-]{0,31})"
+_TEXT = r"([ -#%-)+\-./0-9:-~]*)"
+_SEQ = r"(0|[1-9][0-9]{0,4})"
+
+_PNT = re.compile(f"PNT,{_SEQ},{_UINT},{_NAME}" + f",{_INT}" * 3 + r",(0|[1-9][0-9]{0,7})" * 3 + r",(0|[1-9][0-9]?)")
+_ERR = re.compile(f"ERR,{_SEQ},([0-9]{{1,4}}),{_TEXT}")
+_ACK = re.compile(f"ACK,{_SEQ}")
+_HBT = re.compile(f"HBT,{_SEQ},{_UINT},([0-2])")
+_IDN = re.compile(f"IDN,{_SEQ},([0-9]{{1,3}}),{_TEXT},{_TEXT},{_TEXT},{_TEXT}")
+
+
+def _point(g: tuple[str, ...]) -> PointLine:
+    n = [int(v) for v in g[3:]]
+    if n[6] & ~FLAG_MASK:
+        raise ValueError(f"unknown flags {n[6]}")
+    return PointLine(int(g[0]), int(g[1]), g[2], (n[0], n[1], n[2]), (n[3], n[4], n[5]), n[6])
+
+
+def parse_body(body: str) -> Reply:
+    """The reply that `body` (the text between $ and *) spells; ValueError for anything else."""
+    reply: Reply
+    if m := _PNT.fullmatch(body):
+        reply = _point(m.groups())
+    elif m := _HBT.fullmatch(body):
+        reply = HeartbeatLine(int(m[1]), int(m[2]), int(m[3]))
+    elif m := _ACK.fullmatch(body):
+        reply = AckLine(int(m[1]))
+    elif m := _ERR.fullmatch(body):
+        reply = RefusalLine(int(m[1]), int(m[2]), m[3])
+    elif m := _IDN.fullmatch(body):
+        reply = IdentityLine(int(m[1]), int(m[2]), m[3], m[4], m[5], m[6])
+    else:
+        raise ValueError(f"not a reply of the protocol: {body!r}")
+    if reply.seq >= SEQ_MODULUS:
+        raise ValueError(f"seq {reply.seq}, limit {SEQ_MODULUS - 1}")
+    return reply
+
+
+def parse_line(line: bytes) -> Reply:
+    """One whole line, from $ to line feed, checksum verified; ValueError for anything else."""
+    if len(line) > LINE_MAX or line[:1] != b"$" or line[-2:] != b"\r\n" or line[-7:-6] != b"*":
+        raise ValueError("not framed as a line")
+    body = line[1:-7]
+    if line[-6:-2] != b"%04X" % crc16_arc(body):
+        raise ValueError("checksum differs")
+    return parse_body(body.decode("ascii"))
+
+
+class LineParser:
+    """Bytes in, intact replies out. `$` occurs only at the start of a line, so it always starts a fresh one.
+
+    Counts `bad` lines (framing, checksum, grammar) and `noise` bytes between lines. Keeps at most one unfinished
+    line of LINE_MAX bytes.
+    """
+
+    def __init__(self) -> None:
+        self.bad = 0
+        self.noise = 0
+        self._rest = b""
+
+    def feed(self, data: bytes) -> list[Reply]:
+        """The replies completed by `data`, in order."""
+        head, *starts = (self._rest + data).split(b"$")
+        self.noise += len(head)
+        self._rest = b""
+        replies: list[Reply] = []
+        for index, piece in enumerate(starts):
+            self._take(piece, index == len(starts) - 1, replies)
+        return replies
+
+    def _take(self, piece: bytes, is_last: bool, replies: list[Reply]) -> None:
+        """`piece` is what follows one `$`, up to the next one or to the end of what has arrived."""
+        text, newline, after = piece.partition(b"\n")
+        if not newline and is_last and len(piece) < LINE_MAX:
+            self._rest = b"$" + piece
+            return
+        self.noise += len(after)
+        try:
+            replies.append(parse_line(b"$" + text + newline))
+        except ValueError:
+            self.bad += 1
+
+    def reset(self) -> None:
+        """Forget the unfinished line; the counts stay."""
+        self._rest = b""

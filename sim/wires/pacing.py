@@ -1,0 +1,42 @@
+"""The speed of a serial line: bytes arrive when their last bit has, at 10 bits a byte (8N1)."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Protocol
+
+BITS_PER_BYTE = 10
+
+
+class DeviceEnd(Protocol):
+    """What a simulated serial device holds of its wire: bytes out by `write`, bytes in by `on_bytes`."""
+
+    on_bytes: Callable[[bytes], None]
+
+    def write(self, data: bytes) -> None: ...
+
+
+class PacedChannel:
+    """One direction of a line: chunks queue behind each other, each delivered whole when its last byte is through."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, baud: int, deliver: Callable[[bytes], None]) -> None:
+        self._loop, self._deliver = loop, deliver
+        self._byte_s = BITS_PER_BYTE / baud
+        self._free_at_s = 0.0
+        self._epoch = 0
+
+    def send(self, data: bytes) -> None:
+        """Put `data` on the line; the loop delivers it after the bytes ahead of it and its own."""
+        if data:
+            self._free_at_s = max(self._loop.time(), self._free_at_s) + len(data) * self._byte_s
+            self._loop.call_at(self._free_at_s, self._arrive, data, self._epoch)
+
+    def cut(self) -> None:
+        """Lose every byte that is still under way."""
+        self._epoch += 1
+        self._free_at_s = 0.0
+
+    def _arrive(self, data: bytes, epoch: int) -> None:
+        if epoch == self._epoch:
+            self._deliver(data)
