@@ -138,8 +138,9 @@ class Instrument:
         if not (self.measure_s < self._fast.below_s and chance < self._fast.probability):
             return np.zeros(3)
         low, high = self._fast.um
-        length = self._draws.scale("fast_outliers") * (low + (high - low) * size) * 1e-3
-        return length * np.array((0.0, np.cos(2.0 * np.pi * turn), np.sin(2.0 * np.pi * turn)))
+        length = self._draws.scale("fast_outliers") * (low + (high - low) * float(size)) * 1e-3
+        angle = 2.0 * np.pi * float(turn)
+        return np.array((0.0, length * np.cos(angle), length * np.sin(angle)))
 
 
 def _neighbour(sight: Array, index: int, luck: float) -> int:
