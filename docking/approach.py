@@ -54,12 +54,12 @@ class Approach:
         goal = goal_pose(X_WC, X_WM, self.features, -station.standoff_mm * self._axis_W(X_WM))
         return correction_to(X_WC.X_MN, goal, self.face_C_mm)
 
-    def close_enough_mm(self, station: Station) -> float:
+    def close_enough_mm(self, station: Station, sigma_mm: float) -> float:
         """At a station before contact: the deviation with which the approach may go on, 2 % of the gap, 0.5 mm at most,
-        never less than the dead-band."""
+        never less than the dead-band or what the measurement can tell."""
         tolerance = float(np.min(self.features.tolerance_mm))
         dead_band = min(self.convergence.dead_band_mm, self.convergence.dead_band_fraction * tolerance)
-        return max(dead_band, min(0.5, 0.02 * station.standoff_mm))
+        return max(dead_band, sigma_mm, min(0.5, 0.02 * station.standoff_mm))
 
     def verdict(self, history: list[Attempt], station: Station) -> Verdict:
         """What to do at the last station: accept, move, measure more, or give up."""

@@ -22,7 +22,7 @@ from docking.errors import (
     PlanError,
     PlanStale,
 )
-from docking.kinematics import Positioners, figure_residual_mm, pose_from_axes
+from docking.kinematics import Positioners, ball_reactions_n, figure_residual_mm, pose_from_axes, sink_mm
 from docking.motion.settle import SettleSettings, settle
 from docking.planning import Action, Attempt, GuardSettings, PlanRequest, PlanSettings, check_correction, make_plan
 from docking.ports import Journal, Motion, Operator
@@ -156,13 +156,16 @@ class Procedure:
         return Event.FITTED
 
     def _check_against_axes(self, fit: Fit) -> None:
-        """The fitted pose must put the balls where the axes say the sockets are; catches swapped axes and frames."""
-        gaps = np.linalg.norm(
-            figure_residual_mm(self._settings.positioners, self.motion.feedback().position_mm, fit.X_MN), axis=1
-        )
+        """The fitted pose must put the balls where the axes say the loaded sockets are: catches swapped axes, frames."""
+        positioners, load, X_WC = self._settings.positioners, self._settings.plan.load, fit.X_MN
+        balls = X_WC.apply(positioners.balls_C_mm)
+        weight = load.mass_kg * load.gravity_m_s2
+        reactions = ball_reactions_n(positioners, balls, X_WC.apply(load.com_C_mm), weight)[0]
+        loaded = figure_residual_mm(positioners, self.motion.feedback().position_mm, X_WC) + sink_mm(positioners, reactions)
+        gaps = np.linalg.norm(loaded, axis=1)
         worst = int(np.argmax(gaps))
         if not (gaps[worst] <= self._settings.plausibility_mm):
-            where = f"ball {self._settings.positioners.names[worst]}"
+            where = f"ball {positioners.names[worst]}"
             raise FrameImplausible(where, value=float(gaps[worst]), limit=self._settings.plausibility_mm)
 
     async def _judge(self) -> Event:
@@ -181,7 +184,7 @@ class Procedure:
         self._check_check_points(fit)
         if station is self._approach.stations[-1]:
             return self._judge_contact(station)
-        if float(np.max(errors.norm_mm)) <= self._approach.close_enough_mm(station):
+        if float(errors.norm_mm[i]) <= self._approach.close_enough_mm(station, float(errors.sigma_mm[i])):
             p.stage, p.corrections, p.kind, p.history = p.stage + 1, 0, "approach", []
             return Event.MOVE_NEEDED
         return self._correct(station)

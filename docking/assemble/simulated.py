@@ -11,6 +11,7 @@ from docking.assemble.controller import Wires
 from docking.config import CellFile, JobFile
 from docking.config.cell import CanBus, ModbusBus
 from sim.canopen.group import DriveGroup
+from sim.canopen.settings import DriveSettings
 from sim.instrument import Instrument
 from sim.plant import Plant
 from sim.plc.group import PlcGroup
@@ -41,6 +42,7 @@ class FarEnd:
 
     plant: Plant
     instrument: Instrument
+    truth: TruthFile
     loop: asyncio.AbstractEventLoop
     seed: int
     devices: list[Any] = field(default_factory=list)
@@ -52,7 +54,9 @@ class FarEnd:
 
     def drives(self, cell: CellFile, wire: CanEnd) -> None:
         """Put the drives on a CAN bus."""
-        self.devices.append(DriveGroup(self.plant, cell, wire, self.loop))
+        group = DriveGroup(self.plant, cell, DriveSettings(sync_loss=self.truth.drives.sync_loss), wire, self.loop)
+        group.start()
+        self.devices.append(group)
 
     async def plcs(self, cell: CellFile, addresses: dict[str, tuple[str, int]] | None) -> dict[str, tuple[str, int]]:
         """Let the positioner PLCs listen; return their addresses."""
@@ -72,7 +76,7 @@ class FarEnd:
 def make_far_end(cell: CellFile, job: JobFile, truth: TruthFile, seed: int) -> FarEnd:
     """Plant and instrument of one seed; call on the loop that will run them."""
     plant = Plant(cell, job, truth, seed)
-    return FarEnd(plant, Instrument(plant, cell, truth, seed), asyncio.get_running_loop(), seed)
+    return FarEnd(plant, Instrument(plant, cell, truth, seed), truth, asyncio.get_running_loop(), seed)
 
 
 async def virtual_wires(cell: CellFile, far: FarEnd) -> Wires:
@@ -81,7 +85,9 @@ async def virtual_wires(cell: CellFile, far: FarEnd) -> Wires:
     far.tracker(cell, serial.far)
     if isinstance(cell.bus, CanBus):
         bus = VirtualCan(far.loop, cell.bus.bitrate)
-        far.drives(cell, bus.end())
+        far_end = bus.end()
+        await far_end.open()
+        far.drives(cell, far_end)
         return Wires(serial.near, can=bus.end())
     return Wires(serial.near, modbus=await far.plcs(cell, None))
 
