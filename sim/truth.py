@@ -205,7 +205,7 @@ class Drives(Model):
     brake_mm_s2: Positive
     back_drive_mm_s2: NonNegative
     passive_friction_n: Positive
-    sync_loss: Literal["quick-stop", "hold", "ignore"]
+    sync_loss: Literal["hold", "ignore", "extrapolate", "quick-stop", "fault"]
 
 
 class InstrumentTruth(Model):
