@@ -1,0 +1,278 @@
+"""Positioner PLCs that play a queue of segments after one common start edge (docking.ports.QueuedPositioners)."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections import deque
+from collections.abc import Awaitable, Callable, Iterable, Mapping
+from typing import TypeVar, cast
+
+import numpy as np
+
+from docking.config.cell import CellFile, ModbusBus
+from docking.errors import (
+    BadArgument,
+    DeviceSilent,
+    DockingError,
+    EnableFailed,
+    LinkLost,
+    OutcomeUnknown,
+    SegmentRejected,
+)
+from docking.types import Array, AxisState, Feedback, Identity, Plan
+from drivers.positioner_plc import ENABLE_S, PositionerPlc, Segments
+from drivers.register_map import load_map
+
+RESERVE_S = 1.0
+"""Path time kept in the queues beyond what a stop needs."""
+PUSHES_A_POLL = 4
+LAG_CYCLES = 3
+MISSES = 2
+START_MM = 0.01
+VERBS = ("run", "hold", "resume", "stop", "quick-stop", "reset")
+T = TypeVar("T")
+_MOVING = ("armed", "running", "held", "done", "enabled")
+
+
+class _Watch:
+    """What the last polls of one PLC showed: lost replies and both heartbeats."""
+
+    def __init__(self) -> None:
+        self.misses = 0
+        self._sent: deque[int] = deque(maxlen=LAG_CYCLES)
+        self._alive = -1
+        self._still = 0
+
+    def complaint(self, sent: int, echo: int, alive: int) -> str:
+        """Why the PLC or the link is not alive after this poll; empty when all is well."""
+        oldest = self._sent[0] if len(self._sent) == LAG_CYCLES else echo
+        self._sent.append(sent)
+        self._still = self._still + 1 if alive == self._alive else 0
+        self._alive = alive
+        if (echo - oldest) & 0x8000:
+            return f"the echo of the heartbeat lags more than {LAG_CYCLES} cycles"
+        if self._still > LAG_CYCLES:
+            return f"the heartbeat of the PLC stood still for {self._still} cycles"
+        return ""
+
+
+def _shown(plc: PositionerPlc) -> AxisState:
+    """What the driven axes of this PLC are doing."""
+    state = plc.state
+    if state == "fault" or plc.status.head["fault"]:
+        return AxisState.FAULT
+    if state == "stopping":
+        return AxisState.STOPPING
+    return AxisState.ENABLED if state in _MOVING else AxisState.DISABLED
+
+
+class ModbusPositioners:
+    """All positioners of a cell, one PLC each; construct and use it inside one running loop.
+
+    `addresses` overrides host and port of the cell file by positioner name. `on_lost` is called with the positioner
+    and the reason at once when a connection breaks.
+    """
+
+    def __init__(self, cell: CellFile, addresses: Mapping[str, tuple[str, int]] | None = None) -> None:
+        if not isinstance(cell.bus, ModbusBus):
+            raise BadArgument("bus", "this cell has no Modbus positioners", value=cell.bus.kind)
+        self._cell, self._bus = cell, cell.bus
+        self.axes = cell.axis_names
+        self.segment_s = self._bus.segment_s
+        self._map = load_map(self._bus.map)
+        given = addresses or {}
+        self._addresses = {p.name: given.get(p.name, (p.host or "127.0.0.1", p.port or 502)) for p in cell.positioners}
+        self._min_fill = math.ceil((0.5 * self._bus.ramp_s + 0.5 * RESERVE_S) / self.segment_s) + 2
+        self._depth = math.ceil((0.5 * self._bus.ramp_s + RESERVE_S) / self.segment_s) + 2
+        self._plcs: tuple[PositionerPlc, ...] = ()
+        self._watches: tuple[_Watch, ...] = ()
+        self._alone = asyncio.Lock()
+        self.on_lost: Callable[[str, str], None] = lambda where, reason: None
+        self.path_spread_s = float("nan")
+        um = 1.0 / self._map.scale["position_per_mm"]
+        self._units = np.array([[um], [um], [self._map.scale["force_n"]]])
+        self._shown: list[AxisState] = []
+        self._axis_states: tuple[AxisState, ...] = ()
+
+    async def bring_up(self) -> tuple[Identity, ...]:
+        """Connect to every PLC, prove identity, watchdog, ramp and strokes; axes stay disabled."""
+        self._plcs = tuple(
+            PositionerPlc(p, self._bus, self._map, self._addresses[p.name]) for p in self._cell.positioners
+        )
+        self._watches = tuple(_Watch() for _ in self._plcs)
+        for plc in self._plcs:
+            plc.unit.on_lost = self._lost_hook(plc.where)
+        return tuple(await self._all(plc.bring_up(self._min_fill) for plc in self._plcs))
+
+    def _lost_hook(self, where: str) -> Callable[[str], None]:
+        return lambda reason: self.on_lost(where, reason)
+
+    async def enable(self) -> Feedback:
+        """Enable the driven axes where they stand; EnableFailed names a PLC that is in fault or does not follow."""
+        async with self._alone:
+            await self._all(plc.refresh() for plc in self._plcs)
+            for plc in self._plcs:
+                if plc.state == "fault":
+                    raise EnableFailed(plc.where, plc.fault_words(), value="fault")
+            await self._all(plc.command("enable") for plc in self._plcs)
+            await self._all(plc.reach(ENABLE_S, "enabled", "held", "done") for plc in self._plcs)
+            return self._feedback()
+
+    async def load(self, plan: Plan) -> None:
+        """Clear all queues and fill them with the start of `plan`. Nothing moves.
+
+        Raises SegmentRejected when the plan does not begin at the read-back (0.01 mm) or a PLC rejects a segment.
+        """
+        if plan.axes != self.axes or not abs(plan.period_s - self.segment_s) <= 1e-9:
+            raise BadArgument(
+                "plan", "axes or period differ from the cell's", value=plan.period_s, limit=self.segment_s
+            )
+        async with self._alone:
+            await self._all(plc.command("stop") for plc in self._plcs)
+            await self._all(plc.reach(self._bus.ramp_s + ENABLE_S, "enabled") for plc in self._plcs)
+            self._check_start(plan)
+            per_mm = self._map.scale["position_per_mm"]
+            raw = np.rint(plan.q_mm * per_mm).astype(np.int64)
+            for i, plc in enumerate(self._plcs):
+                rows = tuple(map(tuple, raw[:, 3 * i : 3 * i + 3].tolist()))
+                plc.take(Segments(plan.plan_id & 0xFFFFFFFF, round(self.segment_s * 1000), rows))
+            await self._all(self._prefill(plc) for plc in self._plcs)
+
+    def _check_start(self, plan: Plan) -> None:
+        off_mm = np.where(self._cell.driven, np.abs(plan.q_mm[0] - self._position_mm()), 0.0)
+        worst = int(np.argmax(off_mm))
+        if not off_mm[worst] <= START_MM:
+            cause = f"the plan begins {off_mm[worst]:.4f} mm from where the axis stands"
+            raise SegmentRejected(self.axes[worst], cause, value=6)
+
+    async def _prefill(self, plc: PositionerPlc) -> None:
+        await plc.push()
+        while plc.waiting and plc.depth < self._depth:
+            await self._push_or_look(plc)
+
+    @staticmethod
+    async def _push_or_look(plc: PositionerPlc) -> None:
+        """Push; when the reply is lost, read back once. A second loss in a row is raised."""
+        try:
+            await plc.push()
+        except OutcomeUnknown:
+            await plc.look()
+
+    async def command(self, verb: str) -> None:
+        """`run`, `hold`, `resume`, `stop`, `quick-stop` or `reset` on every PLC.
+
+        All PLCs are tried before an error is raised. A `run` or `resume` that one PLC did not take is withdrawn from
+        the others: the common line cannot rise before all have taken it.
+        """
+        if verb not in VERBS:
+            raise BadArgument("verb", f"one of {', '.join(VERBS)}", value=verb)
+        async with self._alone:
+            if verb in ("stop", "quick-stop"):
+                for plc in self._plcs:
+                    plc.abandon()
+            try:
+                await self._all(plc.command(verb) for plc in self._plcs if verb != "reset" or plc.state == "fault")
+            except DockingError:
+                if verb in ("run", "resume"):
+                    await asyncio.gather(*(plc.command("hold") for plc in self._plcs), return_exceptions=True)
+                raise
+
+    async def poll(self) -> Feedback:
+        """One cycle: heartbeat and next segment out, status in, from all PLCs at once.
+
+        Raises DeviceSilent after two lost replies in a row, LinkLost on a broken connection or a heartbeat that
+        stands still, SegmentRejected when a PLC rejects a segment.
+        """
+        async with self._alone:
+            await self._all(self._cycle(plc, watch) for plc, watch in zip(self._plcs, self._watches, strict=True))
+            return self._feedback()
+
+    async def _cycle(self, plc: PositionerPlc, watch: _Watch) -> None:
+        try:
+            if watch.misses:
+                await plc.look()
+            elif self._wants(plc, self._depth):
+                await plc.push()
+            else:
+                await plc.refresh()
+            watch.misses = 0
+            for _ in range(PUSHES_A_POLL - 1):
+                if not self._wants(plc, self._depth - 1):
+                    break
+                await plc.push()
+        except OutcomeUnknown:
+            watch.misses += 1
+            if watch.misses >= MISSES:
+                raise DeviceSilent(
+                    plc.where, f"{watch.misses} replies lost in a row", limit=self._bus.timeout_s
+                ) from None
+            return
+        head = plc.status.head
+        complaint = watch.complaint(plc.heartbeat, head["hb_echo"], head["hb_plc"])
+        if complaint:
+            raise LinkLost(plc.where, complaint)
+
+    @staticmethod
+    def _wants(plc: PositionerPlc, depth: int) -> bool:
+        """True when the queue is shorter than `depth` and the PLC takes segments."""
+        return plc.waiting > 0 and plc.depth < depth and plc.state in _MOVING
+
+    async def close(self) -> None:
+        """Disable all axes (ramp, brakes, power) and disconnect."""
+        async with self._alone:
+            await asyncio.gather(*(plc.close() for plc in self._plcs))
+
+    @staticmethod
+    async def _all(tasks: Iterable[Awaitable[T]]) -> list[T]:
+        """Run all to their end together, then raise the first error."""
+        results = await asyncio.gather(*tasks, return_exceptions=True)
+        for result in results:
+            if isinstance(result, BaseException):
+                raise result
+        return cast(list[T], results)
+
+    # read-back -----------------------------------------------------------------------------------------------------
+    def _position_mm(self) -> Array:
+        per_mm = self._map.scale["position_per_mm"]
+        return np.array([axis[0] for plc in self._plcs for axis in plc.status.axes]) / per_mm
+
+    def _feedback(self) -> Feedback:
+        words = np.array([axis[:3] for plc in self._plcs for axis in plc.status.axes], dtype=np.float64)
+        raw = words.T * self._units
+        raw[2, words[:, 2] == self._map.scale["no_force"]] = np.nan
+        times = [plc.path_time_s() for plc in self._plcs]
+        self.path_spread_s = max(times) - min(times)
+        return Feedback(
+            t_s=asyncio.get_running_loop().time(),
+            position_mm=raw[0],
+            following_error_mm=raw[1],
+            force_n=raw[2],
+            states=self._states(),
+            age_cycles=np.array([float(watch.misses) for watch in self._watches for _ in range(3)]),
+            path_time_s=min(times),
+            fault=next((fault for plc in self._plcs if (fault := self._fault(plc)) is not None), None),
+        )
+
+    def _states(self) -> tuple[AxisState, ...]:
+        """State of each axis; a passive axis follows the component and counts as disabled."""
+        shown = [_shown(plc) for plc in self._plcs]
+        if shown != self._shown:
+            self._shown = shown
+            self._axis_states = tuple(
+                state if axis.driven else AxisState.DISABLED
+                for plc, state in zip(self._plcs, shown, strict=True)
+                for axis in plc.config.axes
+            )
+        return self._axis_states
+
+    def _fault(self, plc: PositionerPlc) -> tuple[str, int, str] | None:
+        code = plc.status.head["fault"]
+        if not code:
+            return None
+        bit = self._map.flags["axis_fault"]
+        axes = plc.config.axes
+        index = next((i for i, axis in enumerate(plc.status.axes) if axis[3] & bit), None)
+        if index is None:
+            index = next((i for i, axis in enumerate(axes) if axis.driven), 0)
+        return f"{plc.config.name}.{axes[index].name}", code, self._map.fault(code)

@@ -1,0 +1,141 @@
+"""All positioner PLCs of a cell around one plant: one scan every 10 ms, one common RUN line, one server a positioner.
+
+The RUN line is wired AND: it is high only while every PLC releases it. All PLCs see an edge in the same scan; their
+clocks differ, so their path times drift apart by the difference of `clock_ppm`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from docking.config.cell import CellFile
+from sim.plc.modbus_tcp import ModbusTcpConnection
+from sim.plc.playback import Point
+from sim.plc.positioner import SCAN_S, PositionerPlc
+from sim.plc.registers import AXES, State
+from sim.plc.sensors import PlantView, Readings, Sensors
+
+Address = tuple[str, int]
+FOLLOWING_ERROR_FACTOR = 2.0
+"""A PLC trips at this multiple of the cell's following error limit, after the host had its chance."""
+
+
+class PlcGroup:
+    """The simulated positioner PLCs; `clock_ppm` and `start_late_s` hold one number a positioner."""
+
+    def __init__(
+        self,
+        plant: PlantView,
+        cell: CellFile,
+        clock_ppm: Sequence[float],
+        loop: asyncio.AbstractEventLoop,
+        start_late_s: Sequence[float] = (),
+    ) -> None:
+        self._plant, self._cell, self._loop = plant, cell, loop
+        count = len(cell.positioners)
+        late_s = tuple(start_late_s) or (0.0,) * count
+        has_force = np.repeat([p.load_cell and cell.load_cells is not None for p in cell.positioners], AXES)
+        self._readings = Readings(plant, has_force)
+        trip_mm = FOLLOWING_ERROR_FACTOR * cell.limits.following_error_vmax_mm
+        self.plcs = tuple(
+            PositionerPlc(p, Sensors(self._readings, i), trip_mm, loop.time, late_s[i])
+            for i, p in enumerate(cell.positioners)
+        )
+        self._rates = tuple(1.0 + 1e-6 * ppm for _, ppm in zip(self.plcs, clock_ppm, strict=True))
+        self._driven = np.array(cell.driven, dtype=np.bool_)
+        self._target_mm = np.array(plant.encoder_mm(), dtype=np.float64)
+        self._powered = np.zeros(len(self._driven), dtype=np.bool_)
+        self._braked = self._driven.copy()
+        self._targets: list[Point] = []
+        self._states: list[State] = []
+        self._before_s = self._due_s = loop.time()
+        self._timer: asyncio.TimerHandle | None = None
+        self._servers: list[asyncio.AbstractServer] = []
+        self._connections: set[ModbusTcpConnection] = set()
+
+    async def serve(self, addresses: Mapping[str, Address] | None = None) -> dict[str, Address]:
+        """Start scanning and listen; return the address of every positioner.
+
+        `addresses` overrides the cell file by positioner name; positioners that share an address answer there by
+        their units. Port 0 asks for a free port of its own.
+        """
+        units: dict[Address, dict[int, PositionerPlc]] = {}
+        wanted = {
+            p.name: (addresses or {}).get(p.name, (p.host or "127.0.0.1", p.port or 502))
+            for p in self._cell.positioners
+        }
+        result: dict[str, Address] = {}
+        for config, plc in zip(self._cell.positioners, self.plcs, strict=True):
+            address = wanted[config.name]
+            unit = config.unit or 1
+            if address in units and address[1] != 0:
+                units[address][unit] = plc
+                result[config.name] = address
+                continue
+            shared = {unit: plc}
+            server = await self._listen(address, shared)
+            bound = server.sockets[0].getsockname()[:2] if server.sockets else address
+            units[address] = shared
+            result[config.name] = bound
+        self._due_s = self._before_s = self._loop.time()
+        self._schedule()
+        return result
+
+    async def _listen(self, address: Address, units: Mapping[int, PositionerPlc]) -> asyncio.Server:
+        server = await self._loop.create_server(lambda: ModbusTcpConnection(units, self._connections), *address)
+        self._servers.append(server)
+        return server
+
+    async def close(self) -> None:
+        """Stop scanning, close servers and connections."""
+        if self._timer is not None:
+            self._timer.cancel()
+        for connection in tuple(self._connections):
+            connection.close()
+        for server in self._servers:
+            server.close()
+            await server.wait_closed()
+        self._servers.clear()
+
+    def drop_connections(self, name: str) -> None:
+        """Cut every connection to the positioner `name` (fault injection)."""
+        plc = next(plc for p, plc in zip(self._cell.positioners, self.plcs, strict=True) if p.name == name)
+        for connection in tuple(self._connections):
+            if connection.serves(plc):
+                connection.close()
+
+    def _schedule(self) -> None:
+        # On a real loop a late scan is followed by the next one on the grid; a long pause is not made up for.
+        self._due_s = max(self._due_s + SCAN_S, self._loop.time())
+        self._timer = self._loop.call_at(self._due_s, self._tick)
+
+    def _tick(self) -> None:
+        self.scan(self._loop.time())
+        self._schedule()
+
+    def scan(self, now_s: float) -> None:
+        """One scan of all PLCs and one step of the plant."""
+        dt_s, self._before_s = now_s - self._before_s, now_s
+        for plc in self.plcs:
+            plc.think(now_s)
+        line_high = all(plc.releases_run_line for plc in self.plcs)
+        for plc, rate in zip(self.plcs, self._rates, strict=True):
+            plc.play(line_high, now_s, dt_s * rate)
+        self._draw()
+        self._plant.step(now_s, self._target_mm, self._powered, self._braked)
+        self._readings.next_scan()
+
+    def _draw(self) -> None:
+        """Put what has changed of the PLCs' outputs into arrays; passive axes have neither motor nor brake."""
+        targets = [plc.target_mm for plc in self.plcs]
+        if targets != self._targets:
+            self._targets = targets
+            self._target_mm = np.array([mm for target in targets for mm in target])
+        states = [plc.state for plc in self.plcs]
+        if states != self._states:
+            self._states = states
+            self._powered = np.repeat([plc.powered for plc in self.plcs], AXES) & self._driven
+            self._braked = np.repeat([plc.braked for plc in self.plcs], AXES) & self._driven

@@ -1,0 +1,139 @@
+"""A Modbus TCP server as a PLC has it: pipelined requests, exceptions, unit ids.
+
+Frame: transaction u16, protocol u16 = 0, length u16, unit u8, function u8, data; all big-endian.
+Functions 3, 4 (read), 6, 16 (write), 23 (write, then read) on one table of holding registers a unit.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+from collections.abc import Mapping
+from typing import Protocol, cast
+
+_HEADER = struct.Struct(">HHHBB")
+_SPAN = struct.Struct(">HH")
+_WRITE = struct.Struct(">HHB")
+_READ_WRITE = struct.Struct(">HHHHB")
+
+ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, NO_SUCH_UNIT = 1, 2, 3, 11
+MAX_READ, MAX_WRITE, MAX_READ_WRITE = 125, 123, 121
+
+
+class ModbusRefusal(Exception):
+    """The request is answered with exception `code`."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(code)
+        self.code = code
+
+
+class RegisterDevice(Protocol):
+    """Holding registers of one unit; both methods may raise ModbusRefusal."""
+
+    def read(self, address: int, count: int) -> bytes:
+        """Return `count` registers from `address`, 2 bytes each, big-endian."""
+        ...
+
+    def write(self, address: int, data: bytes) -> None:
+        """Write the registers in `data` (2 bytes each, big-endian) from `address` on, as one act."""
+        ...
+
+
+def _checked(count: int, most: int) -> int:
+    if not 1 <= count <= most:
+        raise ModbusRefusal(ILLEGAL_VALUE)
+    return count
+
+
+def _payload(body: bytes, start: int, count: int, declared: int) -> bytes:
+    data = body[start:]
+    if not len(data) == declared == 2 * count:
+        raise ModbusRefusal(ILLEGAL_VALUE)
+    return data
+
+
+def _read(device: RegisterDevice, body: bytes) -> bytes:
+    address, count = _SPAN.unpack(body)
+    data = device.read(address, _checked(count, MAX_READ))
+    return bytes((len(data),)) + data
+
+
+def _write_one(device: RegisterDevice, body: bytes) -> bytes:
+    address, _value = _SPAN.unpack(body)
+    device.write(address, body[2:4])
+    return body
+
+
+def _write(device: RegisterDevice, body: bytes) -> bytes:
+    address, count, declared = _WRITE.unpack_from(body)
+    device.write(address, _payload(body, 5, _checked(count, MAX_WRITE), declared))
+    return body[:4]
+
+
+def _read_write(device: RegisterDevice, body: bytes) -> bytes:
+    read_at, read_count, write_at, write_count, declared = _READ_WRITE.unpack_from(body)
+    _checked(read_count, MAX_READ)
+    device.write(write_at, _payload(body, 9, _checked(write_count, MAX_READ_WRITE), declared))
+    data = device.read(read_at, read_count)
+    return bytes((len(data),)) + data
+
+
+_FUNCTIONS = {3: _read, 4: _read, 6: _write_one, 16: _write, 23: _read_write}
+
+
+def answer(units: Mapping[int, RegisterDevice], unit: int, function: int, body: bytes) -> bytes:
+    """Return the reply (function code and data) to one request."""
+    try:
+        device = units.get(unit)
+        if device is None:
+            raise ModbusRefusal(NO_SUCH_UNIT)
+        handler = _FUNCTIONS.get(function)
+        if handler is None:
+            raise ModbusRefusal(ILLEGAL_FUNCTION)
+        return bytes((function,)) + handler(device, body)
+    except ModbusRefusal as refusal:
+        return bytes((function | 0x80, refusal.code))
+    except struct.error:
+        return bytes((function | 0x80, ILLEGAL_VALUE))
+
+
+class ModbusTcpConnection(asyncio.Protocol):
+    """One client connection to a host that holds `units` (unit id -> registers)."""
+
+    def __init__(self, units: Mapping[int, RegisterDevice], connections: set[ModbusTcpConnection]) -> None:
+        self._units, self._connections = units, connections
+        self._buffer = b""
+        self._transport: asyncio.Transport
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast(asyncio.Transport, transport)
+        self._connections.add(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._connections.discard(self)
+
+    def close(self) -> None:
+        self._transport.close()
+
+    def serves(self, device: RegisterDevice) -> bool:
+        return device in self._units.values()
+
+    def data_received(self, data: bytes) -> None:
+        buffer = self._buffer + data
+        replies: list[bytes] = []
+        at = 0
+        while len(buffer) - at >= 8:
+            transaction, protocol, length, unit, function = _HEADER.unpack_from(buffer, at)
+            if protocol != 0 or not 2 <= length <= 254:
+                self._transport.close()
+                return
+            end = at + 6 + length
+            if end > len(buffer):
+                break
+            reply = answer(self._units, unit, function, buffer[at + 8 : end])
+            replies.append(struct.pack(">HHHB", transaction, 0, len(reply) + 1, unit) + reply)
+            at = end
+        self._buffer = buffer[at:]
+        if replies:
+            self._transport.write(b"".join(replies))

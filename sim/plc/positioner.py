@@ -1,0 +1,343 @@
+"""One positioner PLC: its registers and what it does with them in each scan.
+
+Power and brakes: power on, then brakes open; to disable: standstill, brakes closed, then power off. Every stop is a
+ramp of the playback rate; while stopping the PLC holds the common RUN line low, so all the others ramp too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from docking.config.cell import PositionerConfig
+from sim.plc import registers as reg
+from sim.plc.modbus_tcp import ILLEGAL_ADDRESS, ILLEGAL_VALUE, ModbusRefusal
+from sim.plc.playback import Playback, Point
+from sim.plc.registers import Command, Fault, Reject, State
+from sim.plc.segments import Segment, SegmentGate
+from sim.plc.sensors import Sensors
+
+SCAN_S = 0.01
+CAPACITY = 256
+POWER_ON_S, BRAKE_S, RUN_LINE_WAIT_S = 0.05, 0.15, 1.0
+RELEASING = frozenset((State.ARMED, State.RUNNING, State.DONE))
+POWERED = frozenset(State) - {State.DISABLED, State.FAULT}
+UNBRAKED = POWERED - {State.ENABLING, State.DISABLING}
+
+
+@dataclass
+class Settings:
+    """What the host sets while the PLC is disabled."""
+
+    watchdog_ms: int = 0
+    ramp_ms: int = 500
+    min_fill: int = 2
+
+
+class PositionerPlc:
+    """Registers, FIFO and state of one positioner. `late_s` is its delay on the common start edge."""
+
+    def __init__(
+        self,
+        config: PositionerConfig,
+        sensors: Sensors,
+        trip_mm: float,
+        clock: Callable[[], float],
+        late_s: float = 0.0,
+    ) -> None:
+        self._config, self._sensors, self._trip_mm, self._clock, self._late_s = config, sensors, trip_mm, clock, late_s
+        self._gate = SegmentGate(config)
+        self.queue = Playback(CAPACITY)
+        self.settings = Settings()
+        self.state, self.fault = State.DISABLED, Fault.NONE
+        self.target_mm: Point = sensors.point_mm()
+        self._after_stop = State.HELD
+        self._clear_after_stop = False
+        self._since_s = clock()
+        self._plan_id = 0
+        self._segment_result, self._command_result = Reject.NONE, Reject.NONE
+        self._command_ack = 0
+        self._pending: tuple[int, int, int] | None = None
+        self._heartbeat, self._heartbeat_s, self._heartbeat_seen = 0, clock(), False
+        self._line_high = False
+        self._fault_axis = -1
+        self._start_rate = 0.0
+        self._scans = 0
+        self._station = reg.crc16(config.name.encode("ascii"))
+        self._identity = self._identity_block()
+        self._limits = b"".join(
+            reg.LIMITS.pack(round(a.stroke_mm[0] * 1000), round(a.stroke_mm[1] * 1000), round(a.v_mm_s * 1000))
+            for a in config.axes
+        )
+
+    def _identity_block(self) -> bytes:
+        name = self._config.name.encode("ascii")
+        return reg.IDENTITY.pack(
+            reg.MAGIC, reg.MAP_VERSION, reg.AXES, round(SCAN_S * 1000), CAPACITY, name,
+            b"SimPositioner", b"PLC-3", b"SP-" + name[:12], b"1.0",
+        )  # fmt: skip
+
+    # registers -----------------------------------------------------------------------------------------------------
+    def read(self, address: int, count: int) -> bytes:
+        """Registers of one block; a span that leaves its block is refused."""
+        for start, block in (
+            (reg.STATUS_AT, self._status),
+            (reg.SETTINGS_AT, self._settings_block),
+            (reg.IDENTITY_AT, lambda: self._identity),
+            (reg.LIMITS_AT, lambda: self._limits),
+        ):
+            if address >= start:
+                data = block()[2 * (address - start) : 2 * (address - start + count)]
+                if len(data) == 2 * count:
+                    return data
+        raise ModbusRefusal(ILLEGAL_ADDRESS)
+
+    def write(self, address: int, data: bytes) -> None:
+        """A whole block only: a command, a segment, the settings or a heartbeat. No single word moves an axis."""
+        if address == reg.HEARTBEAT_AT and len(data) in (2, 2 + reg.SEGMENT_BYTES):
+            self._beat(int.from_bytes(data[:2], "big"))
+            if len(data) > 2:
+                self._take_segment(data[2:])
+        elif address == reg.COMMAND_AT and len(data) == reg.COMMAND.size:
+            self._pending = reg.COMMAND.unpack(data)
+        elif address == reg.SEGMENT_AT and len(data) == reg.SEGMENT_BYTES:
+            self._take_segment(data)
+        elif address == reg.SETTINGS_AT and len(data) == reg.SETTINGS.size:
+            self._set(*reg.SETTINGS.unpack(data))
+        else:
+            raise ModbusRefusal(ILLEGAL_ADDRESS)
+
+    def _beat(self, count: int) -> None:
+        if count != self._heartbeat:
+            self._heartbeat, self._heartbeat_s, self._heartbeat_seen = count, self._clock(), True
+
+    def _set(self, watchdog_ms: int, ramp_ms: int, min_fill: int) -> None:
+        possible = watchdog_ms <= 5000 and 50 <= ramp_ms <= 5000 and 2 <= min_fill <= CAPACITY
+        if self.state is not State.DISABLED or not possible:
+            raise ModbusRefusal(ILLEGAL_VALUE)
+        self.settings = Settings(watchdog_ms, ramp_ms, min_fill)
+        self.queue.ramp_s = ramp_ms / 1000.0
+
+    def _take_segment(self, data: bytes) -> None:
+        """Enter the segment, absorb a repetition of the last one, or say why not."""
+        segment = Segment.decode(data)
+        repeated = segment.sequence == self.queue.last_seq != 0 and segment.plan_id == self._plan_id
+        if repeated and segment.intact:
+            self._segment_result = Reject.NONE
+            return
+        if self.state not in UNBRAKED:
+            self._segment_result = Reject.NOT_ENABLED
+            return
+        self._segment_result = self._gate.judge(segment, self.queue, self._plan_id, self._sensors.point_mm())
+        if self._segment_result is Reject.NONE:
+            self._plan_id = segment.plan_id
+            self.queue.period_s = segment.dt_ms / 1000.0
+            self.queue.push(segment.point_mm, segment.last)
+
+    def _settings_block(self) -> bytes:
+        s = self.settings
+        return reg.SETTINGS.pack(s.watchdog_ms, s.ramp_ms, s.min_fill)
+
+    def _status(self) -> bytes:
+        queue = self.queue
+        flags = reg.STATUS_RUN_LINE * self._line_high | reg.STATUS_WATCHDOG_ARMED * self._watchdog_armed
+        head = reg.STATUS_HEAD.pack(
+            self._scans & 0xFFFF, self._heartbeat, self.state, self.fault,
+            self._command_ack, self._command_result, self._plan_id, queue.last_seq, queue.play_seq,
+            min(int(queue.fraction * reg.FRACTION), reg.FRACTION - 1), queue.free, self._segment_result, flags,
+            self._station,
+        )  # fmt: skip
+        return head + b"".join(
+            reg.STATUS_AXIS.pack(*row, self._axis_bits(i)) for i, row in enumerate(self._sensors.words())
+        )
+
+    def _axis_bits(self, i: int) -> int:
+        fault = reg.AXIS_FAULT * (i == self._fault_axis)
+        if i not in self._gate.driven:
+            return reg.AXIS_PASSIVE | fault
+        return reg.AXIS_POWERED * self.powered | reg.AXIS_BRAKED * self.braked | fault
+
+    # scan ----------------------------------------------------------------------------------------------------------
+    @property
+    def powered(self) -> bool:
+        return self.state in POWERED
+
+    @property
+    def braked(self) -> bool:
+        return self.state not in UNBRAKED
+
+    @property
+    def _watchdog_armed(self) -> bool:
+        return self.settings.watchdog_ms > 0 and self._heartbeat_seen
+
+    @property
+    def releases_run_line(self) -> bool:
+        """False while this PLC pulls the common line low."""
+        return self.state in RELEASING
+
+    def think(self, now_s: float) -> None:
+        """First half of a scan: commands, watchdogs, timers."""
+        self._scans += 1
+        if self._pending is not None:
+            self._execute(*self._pending, now_s)
+            self._pending = None
+        state = self.state
+        if state is State.DISABLED or state is State.FAULT:
+            return
+        if self._watchdog_expired(now_s):
+            self._trip(Fault.WATCHDOG, now_s)
+        elif state is State.ENABLING:
+            if now_s - self._since_s >= POWER_ON_S + BRAKE_S:
+                self._enter(State.ENABLED, now_s)
+        elif state is State.DISABLING:
+            if now_s - self._since_s >= BRAKE_S:
+                self._enter(State.FAULT if self.fault else State.DISABLED, now_s)
+        else:
+            self._supervise(now_s)
+
+    def play(self, line_high: bool, now_s: float, dt_s: float) -> None:
+        """Second half of a scan, with the RUN line as all PLCs see it: `dt_s` of this PLC's clock pass."""
+        self._line_high = line_high
+        if self.state is State.ARMED and line_high:
+            self._enter(State.RUNNING, now_s)
+            self.queue.start(self._start_rate, self._late_s)
+            return
+        if self.state is State.RUNNING and not line_high:
+            self._stop(State.HELD, now_s)
+        if self.state is State.RUNNING or self.state is State.STOPPING:
+            self.queue.advance(dt_s)
+            self.target_mm = self.queue.point()
+            self._settle(now_s)
+
+    def _settle(self, now_s: float) -> None:
+        if self.state is State.RUNNING and self.queue.at_end:
+            self._enter(State.DONE, now_s)
+        elif self.state is State.STOPPING and (self.queue.rate == 0.0 or self.queue.remaining_s <= 0.0):
+            finished = self.queue.at_end and self._after_stop is State.HELD
+            if self._clear_after_stop:
+                self.queue.clear()
+            self._enter(State.DONE if finished else self._after_stop, now_s)
+
+    def _watchdog_expired(self, now_s: float) -> bool:
+        if self.fault or self.state is State.DISABLING:
+            return False
+        return not (now_s - self._heartbeat_s) * 1000.0 <= self.settings.watchdog_ms
+
+    def _supervise(self, now_s: float) -> None:
+        """Faults of an enabled PLC."""
+        if self.fault:
+            return
+        state, queue = self.state, self.queue
+        if state is State.ARMED:
+            if now_s - self._since_s > RUN_LINE_WAIT_S:
+                self._trip(Fault.RUN_LINE, now_s)
+        elif state is State.RUNNING and not queue.complete and queue.remaining_s <= queue.stopping_s + 2.0 * SCAN_S:
+            self._trip(Fault.UNDERRUN, now_s)
+        elif state is State.RUNNING or state is State.STOPPING:
+            self._check_following(now_s)
+
+    def _check_following(self, now_s: float) -> None:
+        if not self._sensors.strays(self._trip_mm):
+            return
+        errors = self._sensors.following_error_mm()
+        for i in self._gate.driven:
+            if not abs(errors[i]) <= self._trip_mm:
+                self._fault_axis = i
+                self._trip(Fault.FOLLOWING_ERROR, now_s)
+                return
+
+    def _enter(self, state: State, now_s: float) -> None:
+        self.state, self._since_s = state, now_s
+
+    def _trip(self, fault: Fault, now_s: float) -> None:
+        self.fault = fault
+        self._stop(State.DISABLING, now_s)
+
+    def _stop(self, then: State, now_s: float, clear: bool = False) -> None:
+        """Ramp down if path time runs, then go to `then`; a stop that asks for more overrides a weaker one."""
+        if self.state is State.STOPPING and self._after_stop is State.DISABLING:
+            return
+        self._after_stop, self._clear_after_stop = then, clear or self._clear_after_stop
+        if self.state is State.RUNNING or self.state is State.STOPPING:
+            self.queue.stop()
+            self._enter(State.STOPPING, now_s)
+            return
+        if clear:
+            self.queue.clear()
+        self._enter(then, now_s)
+
+    # commands ------------------------------------------------------------------------------------------------------
+    def _execute(self, sequence: int, code: int, mask: int, now_s: float) -> None:
+        """Carry out a command once: a repetition of the last number is absorbed, a gap is refused."""
+        if sequence == self._command_ack:
+            return
+        if sequence != reg.following(self._command_ack):
+            self._command_result = Reject.COMMAND_SEQUENCE
+            return
+        self._command_ack = sequence
+        try:
+            command = Command(code)
+        except ValueError:
+            self._command_result = Reject.UNKNOWN
+            return
+        self._command_result = self._obey(command, mask, now_s)
+
+    def _obey(self, command: Command, mask: int, now_s: float) -> Reject:
+        if command is Command.ENABLE:
+            return self._enable(mask, now_s)
+        if command is Command.RUN:
+            return self._arm(State.ENABLED, 1.0, now_s)
+        if command is Command.RESUME:
+            return self._arm(State.HELD, 0.0, now_s)
+        if command is Command.FAULT_RESET:
+            return self._reset(now_s)
+        return self._halt(command, now_s)
+
+    def _enable(self, mask: int, now_s: float) -> Reject:
+        if mask != sum(1 << i for i in self._gate.driven):
+            return Reject.MASK
+        if not self._watchdog_armed:
+            return Reject.WATCHDOG
+        if self.state is State.DISABLED:
+            self.target_mm = self._sensors.point_mm()
+            self.queue.clear()
+            self._clear_after_stop = False
+            self._enter(State.ENABLING, now_s)
+        elif self.state is State.FAULT or self.state is State.DISABLING:
+            return Reject.STATE
+        return Reject.NONE
+
+    def _arm(self, origin: State, rate: float, now_s: float) -> Reject:
+        """Release the RUN line; path time runs when all others have released it too."""
+        if self.state is not origin:
+            return Reject.STATE
+        queue = self.queue
+        if not queue.knots or not (queue.complete or len(queue.knots) >= self.settings.min_fill):
+            return Reject.TOO_FEW
+        self._start_rate = rate
+        self._clear_after_stop = False
+        self._enter(State.ARMED, now_s)
+        return Reject.NONE
+
+    def _reset(self, now_s: float) -> Reject:
+        if self.state is not State.FAULT:
+            return Reject.STATE
+        self.fault, self._fault_axis = Fault.NONE, -1
+        self._enter(State.DISABLED, now_s)
+        return Reject.NONE
+
+    def _halt(self, command: Command, now_s: float) -> Reject:
+        """Hold, clear, disable and quick stop; nothing to do is no error."""
+        state = self.state
+        if state is State.DISABLED or state is State.FAULT or state is State.DISABLING:
+            return Reject.NONE
+        if command is Command.HOLD:
+            if state is State.ARMED or state is State.RUNNING:
+                self._stop(State.HELD, now_s)
+        elif command is Command.CLEAR:
+            if state is State.ENABLING:
+                return Reject.STATE
+            self._stop(State.ENABLED, now_s, clear=True)
+        else:
+            self._stop(State.DISABLING, now_s, clear=True)
+        return Reject.NONE

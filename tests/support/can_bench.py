@@ -1,0 +1,98 @@
+"""A small CAN cell for tests: cell file, a plant of ideal axes, and master and drives joined by a virtual bus."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from docking.config.cell import CellFile
+from docking.config.load import load_cell
+from docking.types import Array
+from drivers.canopen.positioners import CanopenPositioners
+from sim.canopen import DriveGroup, DriveSettings
+from sim.wires.virtual_can import VirtualCan
+
+CELLS = Path(__file__).parents[2] / "sim" / "cells"
+FALL_MM_S = 50.0
+
+
+class FakePlant:
+    """Motors that follow their set-points exactly, loads that fall when neither torque nor brake holds them.
+
+    `jammed` axes stand still and build up following error. Every call of `step` is kept in `calls`.
+    """
+
+    def __init__(self, axes: tuple[str, ...], start_mm: Array, driven: NDArray[np.bool_]) -> None:
+        self.axes, self.driven = axes, driven
+        self.position = start_mm.copy()
+        self.error = np.zeros(len(axes))
+        self.jammed = np.zeros(len(axes), np.bool_)
+        self.calls: list[tuple[float, Array]] = []
+        self._t_s: float | None = None
+        self._rest = True
+
+    def step(self, t_s: float, target_mm: Array, powered: NDArray[np.bool_], braked: NDArray[np.bool_]) -> None:
+        dt = 0.0 if self._t_s is None else t_s - self._t_s
+        assert dt >= 0.0
+        self._t_s = t_s
+        before, before_error = self.position, self.error
+        active = powered & ~braked & self.driven
+        moving = active & ~self.jammed
+        falling = ~powered & ~braked & self.driven
+        self.position = np.where(moving, target_mm, before) - np.where(falling, FALL_MM_S * dt, 0.0)
+        self.error = np.where(active, target_mm - self.position, 0.0)
+        self._rest = bool((self.position == before).all() and (self.error == before_error).all())
+        self.calls.append((t_s, self.position))
+
+    def encoder_mm(self) -> Array:
+        return self.position
+
+    def following_error_mm(self) -> Array:
+        return self.error
+
+    def at_rest(self) -> bool:
+        return self._rest
+
+    def force_n(self) -> Array:
+        return 1000.0 + 10.0 * np.arange(len(self.axes), dtype=np.float64)
+
+
+def can_cell(name: str = "fuselage-can", **changes: object) -> CellFile:
+    """A reference cell, with values of its bus changed."""
+    cell = load_cell(CELLS / f"{name}.toml")
+    return cell.model_copy(update={"bus": cell.bus.model_copy(update=changes)})
+
+
+class Bench:
+    """Master and drives on one virtual bus."""
+
+    def __init__(self, cell: CellFile, settings: DriveSettings | None = None) -> None:
+        loop = asyncio.get_running_loop()
+        self.cell = cell
+        count = len(cell.axis_names)
+        self.start_mm = 1.5 * np.arange(count, dtype=np.float64) - 3.0
+        self.plant = FakePlant(cell.axis_names, self.start_mm, np.array(cell.driven))
+        self.bus = VirtualCan(loop, 1_000_000, "can0")
+        self.near, self.far = self.bus.end(), self.bus.end()
+        self.far.is_open = True
+        self.drives = DriveGroup(self.plant, cell, settings or DriveSettings(), self.far, loop)
+        self.drives.start()
+        self.master = CanopenPositioners(cell, self.near)
+        self.trace: list[tuple[int, bytes]] = []
+
+    def watch(self) -> None:
+        """Record every frame on the bus."""
+
+        def keep(cob: int, data: bytes) -> bool:
+            self.trace.append((cob, data))
+            return True
+
+        self.bus.keep = keep
+
+    async def ready(self) -> Array:
+        """Bring up and enable; returns the read-back."""
+        await self.master.bring_up()
+        return (await self.master.enable()).position_mm
