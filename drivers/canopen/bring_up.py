@@ -1,0 +1,163 @@
+"""Bring-up of one drive by SDO: identity, written objects and PDO mapping, each read back; a mismatch stops it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+from docking.config.cell import CanBus, LimitsConfig
+from docking.errors import ConfigInvalid, DeviceRefused, ReadBackMismatch, WrongIdentity
+from docking.ports import CanFrame
+from docking.types import Identity
+from drivers.canopen import codec
+from drivers.canopen.nodes import AxisNode
+from drivers.canopen.sdo import SdoClient
+from drivers.maps.objects import ObjectEntry, ObjectMap, PdoEntry
+
+_MODE_S = 0.5
+_NO_SUCH_OBJECT = "06020000h"
+_COB_MASK = codec.COB_INVALID | 0x7FF
+
+
+def interpolation_period(cycle_s: float) -> tuple[int, int]:
+    """60C2h: (value 1..255, exponent of ten) whose product is exactly the cycle. Raises ConfigInvalid."""
+    for exponent in (-2, -3, -4, -5, -6):
+        value = cycle_s / 10.0**exponent
+        if 1.0 <= round(value) <= 255.0 and abs(value - round(value)) <= 1e-6 * value:
+            return round(value), exponent
+    raise ConfigInvalid("bus.cycle_s", (f"{cycle_s} s cannot be told to a drive exactly (60C2h)",))
+
+
+def quantities(node: AxisNode, bus: CanBus, limits: LimitsConfig, omap: ObjectMap) -> dict[str, int]:
+    """The `@` quantities of the object map for one axis, in the drive's units (counts, ms, us)."""
+    counts, axis = bus.counts_per_mm, node.axis
+    value, exponent = interpolation_period(bus.cycle_s)
+    window_mm = omap.following_window_factor * limits.following_error_vmax_mm
+    return {
+        "cycle_us": round(bus.cycle_s * 1e6),
+        "emergency_cob": codec.COB_EMERGENCY + node.node,
+        "host_heartbeat": omap.host_node << 16 | round(bus.drive_timeout_s * 1e3),
+        "heartbeat_ms": round(bus.heartbeat_s * 1e3),
+        "following_window_counts": round(window_mm * counts),
+        "stroke_min_counts": round(axis.stroke_mm[0] * counts),
+        "stroke_max_counts": round(axis.stroke_mm[1] * counts),
+        "quick_stop_counts_s2": round(axis.a_quick_mm_s2 * counts),
+        "interpolation_value": value,
+        "interpolation_exponent": exponent,
+    }
+
+
+class NodeBringUp:
+    """Prepares one pre-operational node. Every error names the axis."""
+
+    def __init__(self, node: AxisNode, omap: ObjectMap, send: Callable[[list[CanFrame]], None]) -> None:
+        self.node = node
+        self.sdo = SdoClient(node.name, node.node, send, omap.abort_text)
+        self._map = omap
+
+    async def run(self, given: dict[str, int]) -> Identity:
+        """Prove who answers; write and read back everything.
+
+        Raises DeviceSilent, DeviceRefused, BadReply, WrongIdentity, ReadBackMismatch.
+        """
+        identity = await self._identify()
+        for name, value in self._map.written:
+            number = given[value[1:]] if isinstance(value, str) else value
+            await self._write(self._map.objects[name], number)
+        await self._map_pdos()
+        await self._set_mode()
+        if self.sdo.stray:
+            cause = f"{self.sdo.stray} answers too many: two devices use node number {self.node.node}"
+            raise WrongIdentity(self.node.name, cause, value="two devices", limit="one device")
+        return identity
+
+    async def standing(self) -> tuple[int, int]:
+        """Statusword and position (counts) as they are before the first read-back frame."""
+        objects = self._map.objects
+        return await self.sdo.read(objects["statusword"]), await self.sdo.read(objects["position"])
+
+    async def _identify(self) -> Identity:
+        objects, read = self._map.objects, self.sdo.read
+        profile = await read(objects["device_type"]) & 0xFFFF
+        self._expect("device profile", profile, self._map.device_profile)
+        found = {name: await read(objects[name]) for name in ("vendor", "product", "revision", "serial")}
+        for name, value in self._map.identity.items():
+            self._expect(name, found[name], value)
+        if self.node.axis.serial_number is not None:
+            self._expect("serial number", found["serial"], self.node.axis.serial_number)
+        modes = await read(objects["supported_modes"])
+        if not modes >> self._map.supported_mode_bit & 1:
+            cause = "the drive has no cyclic synchronous position mode"
+            raise WrongIdentity(self.node.name, cause, value=f"6502h = {modes:08X}h", limit=f"mode {self._map.mode}")
+        name_text = await self._text("device_name")
+        version = await self._text("software_version")
+        product = f"{name_text} {found['product']:08X}h".strip()
+        firmware = f"{version} revision {found['revision']:08X}h".strip()
+        return Identity(self.node.name, f"{found['vendor']:08X}h", product, str(found["serial"]), firmware)
+
+    async def _text(self, name: str) -> str:
+        data = await self.sdo.read_bytes(self._map.objects[name])
+        return data.rstrip(b"\x00").decode("ascii", "replace")
+
+    def _expect(self, what: str, value: int, wanted: int) -> None:
+        if value != wanted:
+            cause = f"{what} of node {self.node.node}"
+            raise WrongIdentity(self.node.name, cause, value=f"{what} {value}", limit=f"{what} {wanted}")
+
+    async def _write(self, entry: ObjectEntry, value: int) -> None:
+        await self.sdo.write(entry, value)
+        await self._confirm(entry, value)
+
+    async def _confirm(self, entry: ObjectEntry, value: int, mask: int = 0xFFFF_FFFF) -> None:
+        found = await self.sdo.read(entry)
+        if found & mask != value & mask:
+            raise ReadBackMismatch(self.node.name, f"object {entry.label}", value=found, limit=value)
+
+    async def _map_pdos(self) -> None:
+        for communication, cob in self._map.pdos_off:
+            await self._switch_off(communication, cob + self.node.node)
+        pdos = self._map.pdos
+        await self._map_pdo(pdos["set_points"], self.node.driven)
+        await self._map_pdo(pdos["read_back"], True)
+        await self._map_pdo(pdos["force"], self.node.load_cell)
+
+    async def _switch_off(self, communication: int, cob: int) -> None:
+        """Make sure that a PDO is off; a drive that has no such PDO is as good."""
+        try:
+            await self._set_cob(communication, cob | codec.COB_INVALID)
+        except DeviceRefused as error:
+            if error.value != _NO_SUCH_OBJECT:
+                raise
+
+    async def _map_pdo(self, pdo: PdoEntry, used: bool) -> None:
+        """Switch a PDO off, describe it, and switch it on only where this axis uses it."""
+        cob = pdo.cob + self.node.node
+        await self._set_cob(pdo.communication, cob | codec.COB_INVALID)
+        if not used:
+            return
+        await self._write(self._entry(pdo, "transmission", pdo.communication, 2, "u8"), pdo.transmission)
+        count = self._entry(pdo, "count", pdo.mapping, 0, "u8")
+        await self._write(count, 0)
+        for number, word in enumerate(pdo.words, start=1):
+            await self._write(self._entry(pdo, f"entry {number}", pdo.mapping, number, "u32"), word)
+        await self._write(count, len(pdo.words))
+        await self._set_cob(pdo.communication, cob)
+
+    async def _set_cob(self, communication: int, cob: int) -> None:
+        entry = ObjectEntry("pdo_cob_id", communication, 1, "u32")
+        await self.sdo.write(entry, cob)
+        await self._confirm(entry, cob, _COB_MASK)
+
+    @staticmethod
+    def _entry(pdo: PdoEntry, what: str, index: int, sub: int, kind: str) -> ObjectEntry:
+        return ObjectEntry(f"{pdo.name}_pdo_{what}", index, sub, kind)
+
+    async def _set_mode(self) -> None:
+        """Select the mode and wait until the drive displays it: a write alone proves nothing."""
+        objects, loop = self._map.objects, asyncio.get_running_loop()
+        await self._write(objects["mode"], self._map.mode)
+        deadline = loop.time() + _MODE_S
+        while await self.sdo.read(objects["mode_display"]) != self._map.mode:
+            if not (loop.time() < deadline):
+                await self._confirm(objects["mode_display"], self._map.mode)
+            await asyncio.sleep(0.02)

@@ -1,0 +1,215 @@
+"""The cyclic image: set-points and the one controlword image out, read-backs in, a whole batch at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from docking.errors import AxisLimitExceeded
+from docking.ports import CanFrame
+from docking.types import Array, AxisState, Feedback, readonly
+from drivers.canopen import cia402, codec
+from drivers.canopen.cia402 import DriveState
+from drivers.canopen.nodes import AxisNode
+from drivers.canopen.watch import NodeWatch
+from drivers.maps.objects import ObjectMap
+
+_INT32_MAX = 2147483647.0
+_FRAME = codec.SET_POINT.itemsize
+_NEVER = -1_000_000
+_NAN = float("nan")
+
+
+class CyclicImage:
+    """What is sent each cycle and what came back; the only owner of the controlwords.
+
+    Driven axes have a set-point frame, passive axes only report. Arrays are in the cell's axis order, (m,).
+    `cycles` counts the SYNCs sent.
+    """
+
+    def __init__(self, nodes: tuple[AxisNode, ...], omap: ObjectMap, counts_per_mm: float) -> None:
+        self.nodes = nodes
+        self.driven: NDArray[np.intp] = np.array([n.index for n in nodes if n.driven], dtype=np.intp)
+        self.cycles = 0
+        self._map, self._counts_per_mm = omap, counts_per_mm
+        self._follows = 1 << omap.status_bits["follows"]
+        self._brake = 1 << omap.status_bits["brake_closed"]
+        self._start_output(omap)
+        self._start_input()
+
+    def _start_output(self, omap: ObjectMap) -> None:
+        self._slots = {int(index): row for row, index in enumerate(self.driven)}
+        self._image = np.zeros(len(self.driven), codec.SET_POINT)
+        self._image["mode"] = omap.mode
+        self._target = self._image["target"]
+        cob = omap.pdos["set_points"].cob
+        self.set_point_cobs = [cob + self.nodes[int(i)].node for i in self.driven]
+        self._frames: list[CanFrame] = []
+        self._setpoint_bytes = b""
+        self._dirty = True
+
+    def _start_input(self) -> None:
+        count = len(self.nodes)
+        self._cobs = [self._map.pdos["read_back"].cob + node.node for node in self.nodes]
+        self._index = {cob: index for index, cob in enumerate(self._cobs)}
+        self._force_index = {self._map.pdos["force"].cob + n.node: n.index for n in self.nodes if n.load_cell}
+        self._raw: list[bytes] = [bytes(codec.READ_BACK.itemsize)] * count
+        self._joined: bytes | None = None
+        self._decoded = b""
+        self._seen = [_NEVER] * count
+        self._force = np.full(count, np.nan)
+        self._force_cycle = _NEVER
+        self._words: list[int] = [0] * count
+        self._states: tuple[DriveState, ...] = (DriveState.UNKNOWN,) * count
+        self._axis_states: tuple[AxisState, ...] = (AxisState.UNKNOWN,) * count
+        self._in_fault: int | None = None
+        self._enabled = np.zeros(len(self.driven), np.bool_)
+        self._position = self._error = self._ages = self._fresh = readonly(np.zeros(count))
+        self._counts: NDArray[np.int32] = np.zeros(count, np.int32)
+
+    # what is sent ------------------------------------------------------------------------------------------------
+    def command(self, index: int, controlword: int) -> None:
+        """Set the controlword of one driven axis."""
+        row = self._slots[index]
+        if int(self._image["controlword"][row]) != controlword:
+            self._image["controlword"][row] = controlword
+            self._dirty = True
+
+    def command_all(self, controlword: int) -> None:
+        """Set the controlword of every driven axis."""
+        self._image["controlword"] = controlword
+        self._dirty = True
+
+    def aim_mm(self, setpoint_mm: Array) -> None:
+        """Take set-points (m,); passive entries are ignored.
+
+        Raises AxisLimitExceeded where one is not finite or does not fit the drives' 32-bit counts.
+        """
+        given = setpoint_mm.tobytes()
+        if given == self._setpoint_bytes:
+            return
+        counts = np.rint(setpoint_mm[self.driven] * self._counts_per_mm)
+        if not (np.abs(counts).max() <= _INT32_MAX):
+            bad = int(self.driven[int(np.argmax(~(np.abs(counts) <= _INT32_MAX)))])
+            raise AxisLimitExceeded(
+                self.nodes[bad].name,
+                "the set-point is not a position that the drive can take",
+                value=float(setpoint_mm[bad]),
+                limit=_INT32_MAX / self._counts_per_mm,
+            )
+        self._target[:] = counts
+        self._setpoint_bytes, self._dirty = given, True
+
+    def aim_at_read_back(self) -> None:
+        """Set the target of every axis that is not enabled to where it stands, to the count; the others keep theirs."""
+        self._decode()
+        counts = np.where(self._enabled, self._target, self._counts[self.driven])
+        if (self._target != counts).any():
+            self._target[:] = counts
+            self._dirty = True
+        self._setpoint_bytes = b""
+
+    def first_step_mm(self) -> Array:
+        """Distance (d,) from each driven axis' read-back to the set-point it is sent."""
+        self._decode()
+        result: Array = (self._target - self._counts[self.driven].astype(np.int64)) / self._counts_per_mm
+        return result
+
+    def frames(self) -> list[CanFrame]:
+        """The frames of this cycle, SYNC last; the list is the caller's to extend only by copying."""
+        if self._dirty:
+            raw = self._image.tobytes()
+            cuts = range(0, len(raw), _FRAME)
+            self._frames = [(cob, raw[i : i + _FRAME]) for cob, i in zip(self.set_point_cobs, cuts, strict=True)]
+            self._frames.append(codec.SYNC)
+            self._dirty = False
+        return self._frames
+
+    # what came back ----------------------------------------------------------------------------------------------
+    def take_batch(self, batch: list[CanFrame]) -> Sequence[CanFrame]:
+        """Take the read-backs out of a batch; return the frames that are something else."""
+        count = len(self._cobs)
+        head = batch[:count]
+        if [frame[0] for frame in head] == self._cobs:
+            raw = [frame[1] for frame in head]
+            joined = b"".join(raw)
+            if len(joined) == count * 8:
+                self._raw, self._joined = raw, joined
+                self._seen = [self.cycles] * count
+                if len(batch) == count:
+                    return ()
+                batch = batch[count:]
+        return [frame for frame in batch if not self._take(frame)]
+
+    def _take(self, frame: CanFrame) -> bool:
+        cob, data = frame
+        index = self._index.get(cob)
+        if index is not None and len(data) == 8:
+            self._raw[index], self._joined = data, None
+            self._seen[index] = self.cycles
+            return True
+        index = self._force_index.get(cob)
+        if index is not None and len(data) == 2:
+            if self._force_cycle != self.cycles:
+                # A new array a cycle: an earlier feedback keeps the one it was given.
+                self._force, self._force_cycle = self._force.copy(), self.cycles
+            self._force[index] = int.from_bytes(data, "little", signed=True) * self._map.newton_per_count
+            return True
+        return False
+
+    def seed(self, index: int, statusword: int, position_counts: int) -> None:
+        """Start from values read by SDO, before the first read-back frame: the axis is to stay where it stands."""
+        data = np.array([(statusword, position_counts, 0)], codec.READ_BACK).tobytes()
+        self._raw = [*self._raw[:index], data, *self._raw[index + 1 :]]
+        self._joined = None
+        if index in self._slots:
+            self._target[self._slots[index]] = position_counts
+            self._dirty = True
+
+    def state(self, index: int) -> DriveState:
+        self._decode()
+        return self._states[index]
+
+    def brake_closed(self, index: int) -> bool:
+        self._decode()
+        return bool(self._words[index] & self._brake)
+
+    def follows(self, index: int) -> bool:
+        """Enabled, brake open, and following its set-points."""
+        enabled = self.state(index) is DriveState.OPERATION_ENABLED
+        return enabled and bool(self._words[index] & self._follows) and not self._words[index] & self._brake
+
+    def age_cycles(self, index: int) -> int:
+        return self.cycles - self._seen[index]
+
+    def _decode(self) -> None:
+        raw = self._joined if self._joined is not None else b"".join(self._raw)
+        self._joined = raw
+        if raw == self._decoded:
+            return
+        table = np.frombuffer(raw, codec.READ_BACK)
+        self._counts = table["position"]
+        self._position = self._counts / self._counts_per_mm
+        self._error = table["following_error"] / self._counts_per_mm
+        self._decoded = raw
+        words: list[int] = table["statusword"].tolist()
+        if words != self._words:
+            self._words = words
+            self._states = tuple(cia402.decode(word) for word in words)
+            self._axis_states = tuple(cia402.AXIS_STATES[state] for state in self._states)
+            faults = [i for i, state in enumerate(self._axis_states) if state is AxisState.FAULT]
+            self._in_fault = faults[0] if faults else None
+            self._enabled = np.array([self._axis_states[i] is AxisState.ENABLED for i in self.driven])
+
+    def feedback(self, t_s: float, watch: NodeWatch) -> Feedback:
+        """The newest read-back; `t_s` is the time of the SYNC that sampled it."""
+        self._decode()
+        ages = self._fresh
+        if min(self._seen) != self.cycles:
+            ages = self.cycles - np.array(self._seen, dtype=np.float64)
+        fault = watch.first
+        if fault is None and self._in_fault is not None:
+            fault = watch.fault_of(self._in_fault)
+        return Feedback(t_s, self._position, self._error, self._force, self._axis_states, ages, _NAN, fault)

@@ -1,0 +1,55 @@
+"""Which CANopen node moves which axis: the cell file seen from the bus."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from docking.config.cell import AxisConfig, CanBus, CellFile
+from docking.errors import ConfigInvalid
+
+
+@dataclass(frozen=True)
+class AxisNode:
+    """One axis on the bus; `index` is its place in the cell's axis order."""
+
+    name: str
+    index: int
+    node: int
+    axis: AxisConfig
+    load_cell: bool
+
+    @property
+    def driven(self) -> bool:
+        return self.axis.driven
+
+    @property
+    def label(self) -> str:
+        """Name and node number, for causes in errors."""
+        return f"{self.name}, node {self.node}"
+
+
+def can_bus_of(cell: CellFile) -> CanBus:
+    """The cell's CAN bus. Raises ConfigInvalid where the cell has another kind of bus."""
+    if not isinstance(cell.bus, CanBus):
+        raise ConfigInvalid(cell.name, (f"bus.kind is {cell.bus.kind!r}, this driver needs 'canopen'",))
+    return cell.bus
+
+
+def axis_nodes(cell: CellFile, host_node: int) -> tuple[AxisNode, ...]:
+    """All axes in cell order. Raises ConfigInvalid for missing, repeated or reserved node numbers."""
+    nodes: list[AxisNode] = []
+    problems: list[str] = []
+    taken = {host_node: "the controller"}
+    for positioner in cell.positioners:
+        for axis in positioner.axes:
+            name = f"{positioner.name}.{axis.name}"
+            if axis.node is None:
+                problems.append(f"axis {name} has no node")
+                continue
+            if axis.node in taken:
+                problems.append(f"axis {name}: node {axis.node} belongs to {taken[axis.node]}")
+            taken[axis.node] = name
+            nodes.append(AxisNode(name, len(nodes), axis.node, axis, positioner.load_cell))
+    if problems:
+        raise ConfigInvalid(cell.name, tuple(problems))
+    return tuple(nodes)

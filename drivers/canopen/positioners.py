@@ -1,0 +1,296 @@
+"""CanopenPositioners: axes on a CAN bus that take one set-point each cycle and apply all at one SYNC."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+
+import numpy as np
+
+from docking.config.cell import CellFile
+from docking.errors import DeviceSilent, EnableFailed, LinkLost, ReadBackMismatch
+from docking.ports import CanFrame, CanLink
+from docking.types import Array, Feedback, Identity
+from drivers.canopen import cia402, codec
+from drivers.canopen.bring_up import NodeBringUp, quantities
+from drivers.canopen.cia402 import DriveState
+from drivers.canopen.cyclic import CyclicImage
+from drivers.canopen.nodes import axis_nodes, can_bus_of
+from drivers.canopen.power import PowerGroup
+from drivers.canopen.watch import NodeWatch
+from drivers.maps.objects import load_object_map
+
+_START_UP_S = 1.0
+_RESET_S = 0.5
+
+
+class CanopenPositioners:
+    """The `StreamedPositioners` port over CiA 402 drives.
+
+    Someone must send SYNC every `cycle_s` from bring-up to closing. Until the first `exchange` after enabling, and
+    while enabling or disabling, this class does so itself; then the caller's tick does, and its end is the end of SYNC
+    and of the heartbeat that the drives watch.
+    """
+
+    def __init__(self, cell: CellFile, link: CanLink) -> None:
+        self._bus, self._limits, self._link = can_bus_of(cell), cell.limits, link
+        self._map = load_object_map(self._bus.map)
+        self._nodes = axis_nodes(cell, self._map.host_node)
+        self.axes: tuple[str, ...] = cell.axis_names
+        self.cycle_s: float = self._bus.cycle_s
+        self._image = CyclicImage(self._nodes, self._map, self._bus.counts_per_mm)
+        self._watch = NodeWatch(self._nodes, self._map, self._bus.heartbeat_s)
+        self._power = PowerGroup(self._image, self._step, self._cause_of)
+        self._setups = tuple(NodeBringUp(node, self._map, link.send) for node in self._nodes)
+        self._heartbeat = codec.heartbeat(self._map.host_node)
+        self._heartbeat_cycles = max(1, round(self._bus.heartbeat_s / self.cycle_s))
+        self._loop: asyncio.AbstractEventLoop
+        self._handlers = self._routes()
+        self._keeper: asyncio.TimerHandle | None = None
+        self._keeper_due_s = self._sync_s = 0.0
+        self._lost: str | None = None
+        self._open = self._live = self._first = self._sequencing = self._stopping = False
+
+    # the port ----------------------------------------------------------------------------------------------------
+    async def bring_up(self) -> tuple[Identity, ...]:
+        """Prove identity and settings of every node; leave the axes disabled and reporting.
+
+        Raises PortMissing, DeviceSilent, WrongIdentity, ReadBackMismatch, DeviceRefused: each names the axis.
+        """
+        self._loop = asyncio.get_running_loop()
+        self._link.on_frames, self._link.on_lost = self._on_frames, self._on_lost
+        await self._link.open()
+        self._open = True
+        self._send([codec.nmt(codec.NMT_PRE_OPERATIONAL, node.node) for node in self._nodes])
+        identities = await self._together([self._prepare(setup) for setup in self._setups])
+        self._send([codec.nmt(codec.NMT_START, node.node) for node in self._nodes])
+        self._keep()
+        await self._all_reporting()
+        self._refuse_powered_passive()
+        await self._settle_power()
+        self._watch.rearm()
+        return identities
+
+    async def enable(self) -> Feedback:
+        """Enable the driven axes as one group, each first commanded to where it stands; return their read-back.
+
+        Raises EnableFailed naming the axis; then all axes are disabled again. Never resets a fault.
+        """
+        if not self._open:
+            raise EnableFailed(self._bus.channel, "the bus has not been brought up", value="bus closed")
+        self._live, self._stopping, self._sequencing = False, False, True
+        self._watch.rearm()
+        try:
+            self._keep()
+            await self._all_reporting()
+            await self._power.enable(self._limits.following_error_rest_mm)
+            self._live = self._first = True
+        except LinkLost as error:
+            raise EnableFailed(error.where, error.cause, value="link lost") from error
+        finally:
+            self._sequencing = False
+        return self._image.feedback(self._sync_s, self._watch)
+
+    def exchange(self, setpoint_mm: Array) -> Feedback:
+        """Send one set-point (m,) per axis and the common SYNC; return the newest read-back. Passive ones are ignored.
+
+        Raises LinkLost, AxisLimitExceeded, and ReadBackMismatch when the first set-point after enabling is not where
+        the axes stand; nothing is sent then.
+        """
+        if self._lost is not None or not self._open:
+            raise LinkLost(self._bus.channel, self._lost or "the bus is not open")
+        if self._keeper is not None and not self._sequencing:
+            self._keeper.cancel()
+            self._keeper = None
+        feedback = self._image.feedback(self._sync_s, self._watch)
+        if self._live:
+            self._image.aim_mm(setpoint_mm)
+            if self._first:
+                self._check_first()
+        self._cycle()
+        return feedback
+
+    def quick_stop(self) -> None:
+        """Tell every drive to stop by itself at once; it stays so until `enable`. Never waits, never raises."""
+        self._live, self._stopping = False, True
+        self._image.command_all(cia402.QUICK_STOP)
+        if self._open and self._lost is None:
+            self._cycle()
+
+    async def reset_faults(self) -> None:
+        """Reset drives that are in fault, on an operator's order only; the axes stay disabled. Raises EnableFailed."""
+        faulted = [int(i) for i in self._image.driven if self._image.state(int(i)) is DriveState.FAULT]
+        self._live, self._sequencing = False, True
+        try:
+            self._keep()
+            for word in (cia402.DISABLE_VOLTAGE, cia402.FAULT_RESET, cia402.DISABLE_VOLTAGE):
+                for index in faulted:
+                    self._image.command(index, word)
+                for _ in range(3):
+                    await self._step()
+        finally:
+            self._sequencing = False
+        for index in faulted:
+            if self._image.state(index) is DriveState.FAULT:
+                raise EnableFailed(self._nodes[index].name, self._cause_of(index), value=DriveState.FAULT.value)
+        self._watch.rearm()
+
+    async def close(self) -> None:
+        """Disable the axes, brakes confirmed first, then release the bus.
+
+        Raises EnableFailed where a brake is not reported closed; that axis keeps its torque, and its drive stops and
+        holds by itself when it misses the heartbeat.
+        """
+        if not self._open:
+            return
+        try:
+            if self._lost is None and self._image.cycles:
+                self._keep()
+                await self._settle_power()
+                self._watch.disarm()
+                self._send([codec.nmt(codec.NMT_PRE_OPERATIONAL, node.node) for node in self._nodes])
+        except LinkLost:
+            self._live = False
+        finally:
+            if self._keeper is not None:
+                self._keeper.cancel()
+                self._keeper = None
+            self._open = False
+            self._link.close()
+
+    # bring-up ----------------------------------------------------------------------------------------------------
+    async def _prepare(self, setup: NodeBringUp) -> Identity:
+        identity = await setup.run(quantities(setup.node, self._bus, self._limits, self._map))
+        statusword, position = await setup.standing()
+        self._image.seed(setup.node.index, statusword, position)
+        return identity
+
+    @staticmethod
+    async def _together(jobs: Sequence[object]) -> tuple[Identity, ...]:
+        """Run the nodes' jobs side by side; raise the first error in axis order after all have ended."""
+        results = await asyncio.gather(*jobs, return_exceptions=True)  # type: ignore[call-overload]
+        for result in results:
+            if isinstance(result, BaseException):
+                raise result
+        return tuple(results)
+
+    async def _all_reporting(self) -> None:
+        """Wait until every node's read-back is fresh and its heartbeat alive. Raises DeviceSilent."""
+        deadline = self._loop.time() + _START_UP_S + 3.0 * self._bus.heartbeat_s
+        first = self._image.cycles + 2
+        while True:
+            await self._step()
+            mute = self._watch.missing_heartbeat(self._loop.time())
+            late = [(node, "no read-back") for node in self._nodes if not (self._image.age_cycles(node.index) <= 1)]
+            late += [] if mute is None else [(mute, "no heartbeat")]
+            if not late and self._image.cycles > first:
+                return
+            if late and not (self._loop.time() < deadline):
+                node, what = late[0]
+                raise DeviceSilent(node.name, f"{what} from node {node.node}", limit=_START_UP_S)
+
+    def _refuse_powered_passive(self) -> None:
+        for node in self._nodes:
+            state = self._image.state(node.index)
+            if not node.driven and cia402.AXIS_STATES[state].value in ("enabled", "stopping"):
+                off = DriveState.SWITCH_ON_DISABLED.value
+                raise ReadBackMismatch(node.name, "a passive axis must be free", value=state.value, limit=off)
+
+    async def _settle_power(self) -> None:
+        self._live, self._stopping, self._sequencing = False, False, True
+        try:
+            await self._power.disable()
+        finally:
+            self._sequencing = False
+
+    # the cycle ---------------------------------------------------------------------------------------------------
+    def _cycle(self) -> None:
+        """Send this cycle's frames and, when due, the heartbeat; look after the nodes' heartbeats at the same rate."""
+        if not self._live:
+            self._image.aim_at_read_back()
+        now_s = self._loop.time()
+        frames = self._image.frames()
+        if self._image.cycles % self._heartbeat_cycles == 0:
+            frames = [*frames, self._heartbeat]
+            self._watch.check(now_s)
+        self._image.cycles += 1
+        self._sync_s = now_s
+        self._link.send(frames)
+
+    def _check_first(self) -> None:
+        limit_mm = self._limits.following_error_rest_mm
+        distance = np.abs(self._image.first_step_mm())
+        if not (distance.max() <= limit_mm):
+            row = int(np.argmax(~(distance <= limit_mm)))
+            self._live = False
+            raise ReadBackMismatch(
+                self._nodes[int(self._image.driven[row])].name,
+                "the first set-point after enabling is not where the axis stands",
+                value=float(distance[row]),
+                limit=limit_mm,
+            )
+        self._first = False
+
+    def _keep(self) -> None:
+        """Begin to send SYNC in every cycle in which nobody else does."""
+        if self._keeper is None:
+            self._keeper_due_s = self._loop.time()
+            self._keeper_tick()
+
+    def _keeper_tick(self) -> None:
+        now_s = self._loop.time()
+        if self._lost is not None:
+            self._keeper = None
+            return
+        if self._image.cycles == 0 or not (now_s - self._sync_s < 0.9 * self.cycle_s):
+            self._cycle()
+        self._keeper_due_s = max(self._keeper_due_s + self.cycle_s, now_s)
+        self._keeper = self._loop.call_at(self._keeper_due_s, self._keeper_tick)
+
+    async def _step(self) -> None:
+        """Let one cycle pass. Raises LinkLost, or EnableFailed when a quick stop came in between."""
+        await asyncio.sleep(self.cycle_s)
+        if self._lost is not None:
+            raise LinkLost(self._bus.channel, self._lost)
+        if self._stopping:
+            raise EnableFailed(self.axes[0], "a quick stop was commanded meanwhile", value="quick stop")
+
+    def _send(self, frames: list[CanFrame]) -> None:
+        self._link.send(frames)
+        if self._lost is not None:
+            raise LinkLost(self._bus.channel, self._lost)
+
+    def _cause_of(self, index: int) -> str:
+        _, code, text = self._watch.fault_of(index)
+        return f"{text} ({code:04X}h)"
+
+    # frames from the bus -----------------------------------------------------------------------------------------
+    def _routes(self) -> dict[int, tuple[str, int]]:
+        """COB-ID -> (what it is, index of the axis), for everything but read-backs."""
+        routes: dict[int, tuple[str, int]] = {}
+        for node in self._nodes:
+            routes[codec.COB_SDO_REPLY + node.node] = ("sdo", node.index)
+            routes[codec.COB_HEARTBEAT + node.node] = ("heartbeat", node.index)
+            routes[codec.COB_EMERGENCY + node.node] = ("emergency", node.index)
+        for cob, index in zip(self._image.set_point_cobs, self._image.driven, strict=True):
+            routes[cob] = ("foreign", int(index))
+        return routes
+
+    def _on_frames(self, batch: list[CanFrame]) -> None:
+        for cob, data in self._image.take_batch(batch):
+            route = self._handlers.get(cob)
+            if route is None:
+                continue
+            kind, index = route
+            if kind == "sdo":
+                self._setups[index].sdo.on_reply(data)
+            elif kind == "heartbeat":
+                self._watch.on_heartbeat(index, data, self._loop.time())
+            elif kind == "emergency":
+                self._watch.on_emergency(index, data)
+            else:
+                self._watch.on_foreign(index)
+
+    def _on_lost(self, reason: str) -> None:
+        if self._lost is None:
+            self._lost = reason

@@ -1,0 +1,125 @@
+"""Loads the CANopen object maps of this folder: which object holds what, what is written, what the PDOs carry."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any
+
+from docking.errors import ConfigInvalid, FileUnreadable
+
+_BITS = {"u8": 8, "i8": 8, "u16": 16, "i16": 16, "u32": 32, "i32": 32, "text": 0}
+
+
+@dataclass(frozen=True)
+class ObjectEntry:
+    """One object of a drive: address and type (`u8 i8 u16 i16 u32 i32 text`)."""
+
+    name: str
+    index: int
+    sub: int
+    type: str
+
+    @property
+    def bits(self) -> int:
+        return _BITS[self.type]
+
+    @property
+    def label(self) -> str:
+        """Address and name as a person reads it: `607Ah:00 target position`."""
+        return f"{self.index:04X}h:{self.sub:02X} {self.name.replace('_', ' ')}"
+
+
+@dataclass(frozen=True)
+class PdoEntry:
+    """One PDO: communication and mapping objects, COB-ID base, transmission type, mapping words (index, sub, bits)."""
+
+    name: str
+    communication: int
+    mapping: int
+    cob: int
+    transmission: int
+    words: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class ObjectMap:
+    """A whole object map; `written` holds constants or `@quantity` texts in the order of writing."""
+
+    name: str
+    device_profile: int
+    supported_mode_bit: int
+    mode: int
+    host_node: int
+    identity: dict[str, int]
+    objects: dict[str, ObjectEntry]
+    written: tuple[tuple[str, int | str], ...]
+    following_window_factor: float
+    pdos: dict[str, PdoEntry]
+    pdos_off: tuple[tuple[int, int], ...]
+    newton_per_count: float
+    status_bits: dict[str, int]
+    emergency: dict[str, str]
+    abort: dict[str, str]
+
+    def emergency_text(self, code: int) -> str:
+        """The words of an emergency code: the longest matching beginning of its four digits."""
+        digits = f"{code:04x}"
+        for length in range(4, 0, -1):
+            text = self.emergency.get(digits[:length])
+            if text is not None:
+                return text
+        return "unknown code"
+
+    def abort_text(self, code: int) -> str:
+        """The words of an SDO abort code."""
+        return self.abort.get(f"{code:08x}", "unknown abort code")
+
+
+def _pdo(name: str, raw: dict[str, Any], objects: dict[str, ObjectEntry]) -> PdoEntry:
+    words = []
+    for item in raw["content"]:
+        entry = objects[item if isinstance(item, str) else item["object"]]
+        bits = entry.bits if isinstance(item, str) else int(item["bits"])
+        words.append(entry.index << 16 | entry.sub << 8 | bits)
+    return PdoEntry(name, raw["communication"], raw["mapping"], raw["cob"], raw["transmission"], tuple(words))
+
+
+def parse_object_map(raw: dict[str, Any]) -> ObjectMap:
+    """Build an object map from its parsed TOML; KeyError or TypeError where the data is not of this form."""
+    objects = {name: ObjectEntry(name, **entry) for name, entry in raw["objects"].items()}
+    unknown = [name for name in raw["written"] if name not in objects]
+    if unknown or any(entry.type not in _BITS for entry in objects.values()):
+        raise KeyError(f"unknown object or type {unknown}")
+    return ObjectMap(
+        name=raw["name"],
+        device_profile=raw["device_profile"],
+        supported_mode_bit=raw["supported_mode_bit"],
+        mode=raw["mode"],
+        host_node=raw["host_node"],
+        identity=dict(raw["identity"]),
+        objects=objects,
+        written=tuple(raw["written"].items()),
+        following_window_factor=float(raw["margins"]["following_window"]),
+        pdos={name: _pdo(name, entry, objects) for name, entry in raw["pdo"].items()},
+        pdos_off=tuple((entry["communication"], entry["cob"]) for entry in raw["pdo_off"].values()),
+        newton_per_count=float(raw["force"]["newton_per_count"]),
+        status_bits=dict(raw["status_bits"]),
+        emergency=dict(raw["emergency"]),
+        abort=dict(raw["abort"]),
+    )
+
+
+def load_object_map(name: str) -> ObjectMap:
+    """Load `drivers/maps/NAME.toml`. Raises FileUnreadable or ConfigInvalid."""
+    where = f"drivers/maps/{name}.toml"
+    try:
+        text = resources.files("drivers.maps").joinpath(f"{name}.toml").read_text("utf-8")
+        raw = tomllib.loads(text)
+    except (OSError, tomllib.TOMLDecodeError) as error:
+        raise FileUnreadable(where, str(error)) from error
+    try:
+        return parse_object_map(raw)
+    except (KeyError, TypeError) as error:
+        raise ConfigInvalid(where, (f"not an object map: {error}",)) from error

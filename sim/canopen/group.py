@@ -1,0 +1,339 @@
+"""DriveGroup: all CANopen nodes of a cell as one station on the bus, around the one plant."""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from docking.config.cell import CanBus, CellFile
+from docking.errors import ConfigInvalid
+from docking.types import Array
+from sim.canopen.access import ObjectAccess
+from sim.canopen.dictionary import INVALID
+from sim.canopen.drives import HOST_LOST, SYNC_LOST, Drives, Stage
+from sim.canopen.heartbeats import Heartbeats
+from sim.canopen.node import PRE_OPERATIONAL, Node
+from sim.canopen.plant_axes import NEWTON_PER_COUNT, PlantAxes
+from sim.canopen.settings import DriveSettings
+from sim.wires.can_frames import CanEnd, CanFrame
+
+_SYNC = 0x80
+_RPDO: Final = np.dtype([("controlword", "<u2"), ("target", "<i4"), ("mode", "i1")])
+_TPDO: Final = np.dtype([("statusword", "<u2"), ("position", "<i4"), ("error", "<i2")])
+_SYNC_LOST_CYCLES: Final = 3.0
+_LONG_S: Final = 0.05
+
+
+class DriveGroup:
+    """m drives in the cell's axis order. `start` powers them up; everything else happens by frames and timers.
+
+    A read-back sampled at a SYNC carries the state before the set-points of that SYNC are applied.
+    """
+
+    def __init__(
+        self, plant: PlantAxes, cell: CellFile, settings: DriveSettings, link: CanEnd, loop: asyncio.AbstractEventLoop
+    ) -> None:
+        if not isinstance(cell.bus, CanBus):
+            raise ConfigInvalid(cell.name, (f"bus.kind is {cell.bus.kind!r}: no CAN drives to simulate",))
+        self._plant, self._link, self._loop, self._settings = plant, link, loop, settings
+        self._counts_per_mm = cell.bus.counts_per_mm
+        self._axes = cell.axis_names
+        self.drives = Drives(plant.encoder_mm(), cell.bus.cycle_s, settings, self._emergency)
+        numbers = [axis.node or 0 for p in cell.positioners for axis in p.axes]
+        self.nodes = [Node(i, number, settings, self) for i, number in enumerate(numbers)]
+        self._handlers = {cob: (node, kind) for node in self.nodes for cob, kind in node.listens()}
+        self._access = ObjectAccess(self.drives, plant, self._counts_per_mm, loop.time)
+        self._heartbeats = Heartbeats(self.nodes, loop, self._transmit, self._host_lost, self._host_returned)
+        self.muted: set[int] = set()
+        self._sync_s: float | None = None
+        self._step_s = 0.0
+        self._syncs = 0
+        self._sync_timer: asyncio.TimerHandle | None = None
+        self._coasting = False
+        self._start_images()
+
+    def _start_images(self) -> None:
+        count = len(self.nodes)
+        self._table = np.zeros(count, _TPDO)
+        self._table_encoder: Array | None = None
+        self._cached: list[CanFrame] | None = None
+        self._pending: dict[int, bytes] = {}
+        self._last_joined = b""
+        self._last_words = self._last_modes = b""
+        self._relatch = False
+        self.remap()
+
+    # life --------------------------------------------------------------------------------------------------------
+    def start(self) -> None:
+        """Power up: every node sends its boot-up message and is pre-operational."""
+        self._link.on_frames = self._on_frames
+        self._transmit([node.boot_up() for node in self.nodes])
+
+    def close(self) -> None:
+        """Stop all timers."""
+        self._heartbeats.close()
+        if self._sync_timer is not None:
+            self._sync_timer.cancel()
+            self._sync_timer = None
+
+    # faults that scenarios switch on -------------------------------------------------------------------------------
+    def mute(self, axis: str, muted: bool = True) -> None:
+        """Cut one node off: it neither hears nor speaks."""
+        index = self._axes.index(axis)
+        (self.muted.add if muted else self.muted.discard)(index)
+        self.remap()
+
+    def trip(self, axis: str, code: int, torque_lost: bool = False) -> None:
+        """Let one drive fault with an emergency code."""
+        self.drives.trip(self._axes.index(axis), code, self._loop.time(), torque_lost)
+        self._cached = None
+
+    def restart(self, axis: str) -> None:
+        """Let one node reset by itself: torque off, boot-up, pre-operational, factory settings."""
+        self.reset_node(self.nodes[self._axes.index(axis)])
+
+    # frames ------------------------------------------------------------------------------------------------------
+    def _on_frames(self, batch: list[CanFrame]) -> None:
+        cobs = self._fast_cobs
+        head = batch[: len(cobs)]
+        if [frame[0] for frame in head] == cobs:
+            joined = b"".join([frame[1] for frame in head])
+            if len(joined) == len(self._fast_rows) * _RPDO.itemsize:
+                self._sync(joined)
+                batch = batch[len(cobs) :]
+        for cob, data in batch:
+            if cob == _SYNC:
+                self._sync(None)
+            elif cob == 0:
+                self._network_management(data)
+            elif cob in self._watched:
+                self._heartbeats.heard(cob - 0x700, self._able)
+            else:
+                self._to_node(cob, data)
+
+    def _to_node(self, cob: int, data: bytes) -> None:
+        found = self._handlers.get(cob)
+        if found is None or found[0].index in self.muted:
+            return
+        node, kind = found
+        if kind == "sdo":
+            answer = node.server.answer(data) if node.answers_sdo else None
+            if answer is not None:
+                self._transmit([(0x580 + node.number, answer)])
+        elif node.takes_set_points and len(data) == _RPDO.itemsize:
+            self._pending[node.index] = data
+
+    def _network_management(self, data: bytes) -> None:
+        if len(data) != 2:
+            return
+        command, number = data
+        for node in self.nodes:
+            if number in (0, node.number) and node.index not in self.muted:
+                node.command(command)
+        self.remap()
+
+    def reset_node(self, node: Node) -> None:
+        """NMT reset: torque off at once, everything back to the factory's values, boot-up."""
+        self.drives.disable_voltage(node.index, self._loop.time())
+        self._heartbeats.forget(node.index)
+        self.drives.modes[node.index] = 0
+        node.forget()
+        self.remap()
+        self._transmit([node.boot_up()])
+
+    def _transmit(self, frames: list[CanFrame]) -> None:
+        if self.muted:
+            silent = {self.nodes[i].number for i in self.muted}
+            frames = [frame for frame in frames if frame[0] & 0x7F not in silent]
+        if frames:
+            self._link.send(frames)
+
+    def remap(self) -> None:
+        """Work out who takes set-points and who reports, after NMT or PDO set-up has changed it."""
+        able = self._able = [node for node in self.nodes if node.index not in self.muted]
+        for node in self.nodes:
+            node.refresh_host()
+        takers = [node for node in able if node.takes_set_points]
+        self._fast_cobs = [0x200 + node.number for node in takers] + [_SYNC]
+        self._fast_rows: NDArray[np.intp] = np.array([node.index for node in takers], dtype=np.intp)
+        self._reporting = [(0x180 + node.number, node.index) for node in able if node.reports]
+        weighing = [node for node in able if node.reports_force]
+        self._force_cobs = [0x280 + node.number for node in weighing]
+        self._force_index: NDArray[np.intp] = np.array([node.index for node in weighing], dtype=np.intp)
+        self._watched = {0x700 + node.host for node in self.nodes if node.host}
+        self._cached, self._relatch, self._last_joined = None, True, b""
+
+    # SYNC --------------------------------------------------------------------------------------------------------
+    def _sync(self, joined: bytes | None) -> None:
+        """One SYNC: bring the plant to now, report what is, then take the new set-points."""
+        now_s = self._loop.time()
+        self._advance(now_s)
+        self._report()
+        if self.drives.busy:
+            self._relatch = True
+        if joined is not None:
+            self._latch_all(joined, now_s)
+        elif self._pending:
+            self._latch_each(now_s)
+        else:
+            self.drives.stay()
+        self._sync_s = self._step_s = now_s
+        if self._sync_timer is None or self._coasting:
+            self._coasting = False
+            self._arm_sync_monitor(now_s)
+
+    def _advance(self, now_s: float) -> None:
+        plant, drives = self._plant, self.drives
+        elapsed_s = now_s - self._step_s
+        set_point = drives.advance(now_s, elapsed_s, plant.encoder_mm)
+        plant.step(now_s, set_point, drives.powered, drives.braked)
+        if not plant.at_rest():
+            drives.monitor(now_s, plant.following_error_mm())
+            self._cached = None
+
+    def _report(self) -> None:
+        """Send the read-backs; the same bytes again while nothing moves."""
+        frames = self._cached
+        if frames is None or self.drives.changed:
+            frames = self._cached = self._encode()
+        if self._syncs % 10 == 0 and self._force_cobs:
+            frames = frames + self._forces()
+        self._syncs += 1
+        if frames:
+            self._link.send(frames)
+
+    def _encode(self) -> list[CanFrame]:
+        plant, table = self._plant, self._table
+        encoder = plant.encoder_mm()
+        if encoder is not self._table_encoder:
+            table["position"] = np.rint(encoder * self._counts_per_mm)
+            self._table_encoder = encoder
+        # The low 16 bits of the 32-bit following error: larger errors wrap, as on a real drive.
+        table["error"] = np.rint(plant.following_error_mm() * self._counts_per_mm).astype(np.int64)
+        table["statusword"] = self.drives.statuswords
+        self.drives.changed = False
+        raw = table.tobytes()
+        return [(cob, raw[8 * i : 8 * i + 8]) for cob, i in self._reporting]
+
+    def _forces(self) -> list[CanFrame]:
+        counts = np.rint(self._plant.force_n()[self._force_index] / NEWTON_PER_COUNT)
+        raw = np.maximum(np.minimum(counts, 32767.0), -32768.0).astype("<i2").tobytes()
+        return [(cob, raw[2 * i : 2 * i + 2]) for i, cob in enumerate(self._force_cobs)]
+
+    def _latch_all(self, joined: bytes, now_s: float) -> None:
+        """The set-points of all drives at once."""
+        if joined == self._last_joined and not self._relatch:
+            self.drives.stay()
+            return
+        image = np.frombuffer(joined, _RPDO)
+        words, modes = image["controlword"].tobytes(), image["mode"].tobytes()
+        if words != self._last_words or modes != self._last_modes or self._relatch:
+            for index, word, mode in zip(
+                self._fast_rows.tolist(), image["controlword"].tolist(), image["mode"].tolist(), strict=True
+            ):
+                self.drives.modes[index] = mode
+                self.drives.control(index, word, now_s)
+            self._last_words, self._last_modes = words, modes
+        self.drives.latch(self._fast_rows, image["target"] / self._counts_per_mm)
+        self._last_joined, self._relatch = joined, self.drives.busy
+        self._pending.clear()
+
+    def _latch_each(self, now_s: float) -> None:
+        """The set-points of those drives that got one since the last SYNC."""
+        rows = np.array(list(self._pending), dtype=np.intp)
+        image = np.frombuffer(b"".join(self._pending.values()), _RPDO)
+        for index, word, mode in zip(
+            rows.tolist(), image["controlword"].tolist(), image["mode"].tolist(), strict=True
+        ):
+            self.drives.modes[index] = mode
+            self.drives.control(index, word, now_s)
+        self.drives.latch(rows, image["target"] / self._counts_per_mm)
+        self._pending.clear()
+        self._last_joined = b""
+
+    # without SYNC ------------------------------------------------------------------------------------------------
+    def _arm_sync_monitor(self, base_s: float) -> None:
+        if self._sync_timer is not None:
+            self._sync_timer.cancel()
+        due_s = base_s + _SYNC_LOST_CYCLES * self.drives.cycle_s
+        self._sync_timer = self._loop.call_at(due_s, self._check_sync)
+
+    def _check_sync(self) -> None:
+        """Runs a few cycles after some SYNC: either newer ones came meanwhile, or the drives are on their own."""
+        self._sync_timer = None
+        now_s, last_s = self._loop.time(), self._sync_s or 0.0
+        if now_s - last_s < (_SYNC_LOST_CYCLES - 0.5) * self.drives.cycle_s:
+            self._arm_sync_monitor(last_s)
+            return
+        if not self._coasting:
+            self._coasting = True
+            reached_s = max(self._step_s, last_s + self.drives.cycle_s)
+            self._advance(reached_s)
+            self._step_s = reached_s
+            self._react_to_lost_sync(now_s)
+        self._coast(now_s)
+
+    def _react_to_lost_sync(self, now_s: float) -> None:
+        for index, stage in enumerate(self.drives.stages):
+            if stage is not Stage.OPERATION:
+                continue
+            if self._settings.sync_loss == "fault":
+                self.drives.trip(index, SYNC_LOST, now_s)
+            elif self._settings.sync_loss == "quick-stop":
+                self._emergency(index, SYNC_LOST)
+                self.drives.quick_stop(index, now_s)
+
+    def _coast(self, now_s: float) -> None:
+        """One step of the drives on their own; again every cycle while something moves, seldom otherwise."""
+        plant, drives = self._plant, self.drives
+        set_point = drives.coast(now_s, now_s - self._step_s, plant.encoder_mm)
+        plant.step(now_s, set_point, drives.powered, drives.braked)
+        self._step_s = now_s
+        self._cached = None
+        if not plant.at_rest():
+            drives.monitor(now_s, plant.following_error_mm())
+        quiet = plant.at_rest() and not drives.busy
+        self._sync_timer = self._loop.call_at(now_s + (_LONG_S if quiet else drives.cycle_s), self._check_sync)
+
+    # the controller's heartbeat ------------------------------------------------------------------------------------
+    def _host_lost(self, node: Node) -> None:
+        """React as 6007h and 1029h say."""
+        now_s = self._loop.time()
+        self._emergency(node.index, HOST_LOST)
+        option = node.number_of(0x6007)
+        if option == 1:
+            self.drives.trip(node.index, HOST_LOST, now_s)
+        elif option == 2:
+            self.drives.disable_voltage(node.index, now_s)
+        elif option == 3:
+            self.drives.quick_stop(node.index, now_s)
+        if node.number_of(0x1029, 1) == 0:
+            node.state = PRE_OPERATIONAL
+            self.remap()
+
+    def _host_returned(self, node: Node) -> None:
+        self._emergency(node.index, 0)
+
+    def _emergency(self, index: int, code: int) -> None:
+        node = self.nodes[index]
+        if not node.number_of(0x1014) & INVALID:
+            register = 0 if code == 0 else 0x11 if code >> 12 == 8 else 0x01
+            self._transmit([(node.number_of(0x1014) & 0x7FF, struct.pack("<HB5x", code, register))])
+
+    # object dictionary -------------------------------------------------------------------------------------------
+    def live(self, index: int, obj: int, sub: int) -> int | None:
+        """Present value of an object that changes by itself, None for a stored one."""
+        return self._access.live(index, obj, sub)
+
+    def changed(self, index: int, obj: int, sub: int, value: int) -> None:
+        """A master has written an object: pass it on to the power stage or the heartbeats."""
+        if obj == 0x1017:
+            self._heartbeats.produce(self.nodes[index], value * 1e-3)
+        elif obj == 0x1016:
+            self.remap()
+        else:
+            self._access.changed(index, obj, sub, value)

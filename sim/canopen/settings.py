@@ -1,0 +1,26 @@
+"""How the simulated drives behave where makers differ."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+SyncLoss = Literal["hold", "ignore", "extrapolate", "quick-stop", "fault"]
+
+
+@dataclass(frozen=True)
+class DriveSettings:
+    """Brake times and the reaction to a missing SYNC (noticed after three cycles).
+
+    `hold` and `ignore`: stand at the last target; `extrapolate`: go on at the last speed until something else stops
+    the drive; `quick-stop` and `fault`: ramp down, with emergency 8700h.
+    """
+
+    brake_open_s: float = 0.08
+    brake_close_s: float = 0.06
+    sync_loss: SyncLoss = "hold"
+    vendor: int = 0x0000_05D0
+    product: int = 0x0402_0008
+    revision: int = 0x0001_0003
+    first_serial: int = 402_000
+    """Serial number of node n is `first_serial` + n."""
