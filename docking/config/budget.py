@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from docking.config.cell import CellFile
-from docking.config.job import JobFile
+from docking.config.job import Component, JobFile, Mate
 from docking.config.nominal import feature_points, mate_feature_points, target_points
 from docking.geometry import pose_from_vector
 from docking.pose.layout import spread
 from docking.pose.least_squares import design, weighted_centroid
 from docking.pose.noise import NOISE_PRESETS, NoiseModel
 from docking.pose.svd import fit_svd
-from docking.types import Array, Points, Pose
+from docking.types import Array, Pose
 
 REMEDIES = {
     "instrument noise on the component": "raise measuring.max_passes, add targets or bring the instrument nearer",
@@ -75,21 +75,17 @@ def feature_budget(cell: CellFile, job: JobFile, passes: int) -> tuple[FeatureBu
     features = feature_points(job.component, cell)
     mates = mate_feature_points(job.component, job.mate, cell)
     at_W = X_WC.apply(features.xyz_mm)
-    component = _part(cell, target_points(job.component.targets, job.component, cell), X_WC, passes, at_W)
-    mate = _part(cell, target_points(job.mate.targets, job.mate, cell), X_WM, passes, at_W)
+    component = _part_covs(_Readings.of(cell, job.component, X_WC, passes), at_W)
+    mate = _part_covs(_Readings.of(cell, job.mate, X_WM, passes), at_W)
     drift_mm = cell.tracker.drift_um_per_h * 1e-3 * cell.limits.fit_age_s / 3600.0
-    grown = [
-        _thermal(part.arms_mm, side.expansion_per_k * side.temperature_sigma_k)
-        for part, side in ((component, job.component), (mate, job.mate))
-    ]
     covs = (
-        component.noise,
-        mate.noise,
-        component.nominal,
-        mate.nominal,
+        component[0],
+        mate[0],
+        component[1],
+        mate[1],
         features.cov_mm2 + mates.cov_mm2,
         np.broadcast_to(np.eye(3) * drift_mm**2, features.cov_mm2.shape),
-        grown[0] + grown[1],
+        component[2] + mate[2],
     )
     return _budgets(job, covs)
 
@@ -108,35 +104,46 @@ def _budgets(job: JobFile, covs: tuple[Array, ...]) -> tuple[FeatureBudget, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class _FittedPart:
-    """Covariances (f, 3, 3) in W that one fitted part gives the features, and their arms (f, 3) from its targets."""
+class _Readings:
+    """What a fit of one part rests on, in W: points (n, 3), covariances (n, 3, 3) of the averaged readings and of the
+    nominal nests, and the sigma of the part's relative expansion."""
 
-    noise: Array
-    nominal: Array
-    arms_mm: Array
+    xyz_mm: Array
+    noise_mm2: Array
+    nominal_mm2: Array
+    expansion: float
 
-
-def _part(cell: CellFile, targets: Points, X_WN: Pose, passes: int, features_W_mm: Array) -> _FittedPart:
-    """The weighted fit's gain G = (A^T S^-1 A)^-1 A^T S^-1 applied to noise and to as-built errors apart."""
-    at_W, X_TW = X_WN.apply(targets.xyz_mm), pose_from_vector(cell.tracker.station_pose).inverse()
-    noise = X_TW.R.T @ noise_of(cell).covariance(X_TW.apply(at_W)) @ X_TW.R / passes
-    nominal = X_WN.R @ targets.cov_mm2 @ X_WN.R.T
-    centre = weighted_centroid(at_W, noise + nominal)
-    scale = np.array([1.0 / spread(at_W).long_mm] * 3 + [1.0] * 3)
-    jac = design(at_W, centre)[:, :, :6] * scale
-    weighted = jac.transpose(0, 2, 1) @ np.linalg.inv(noise + nominal)
-    gain = np.linalg.inv((weighted @ jac).sum(axis=0)) @ weighted
-    reach = design(features_W_mm, centre)[:, :, :6] * scale
-    noise_cov, nominal_cov = ((gain @ cov @ gain.transpose(0, 2, 1)).sum(axis=0) for cov in (noise, nominal))
-    turned = reach.transpose(0, 2, 1)
-    return _FittedPart(reach @ noise_cov @ turned, reach @ nominal_cov @ turned, features_W_mm - centre)
+    @classmethod
+    def of(cls, cell: CellFile, part: Component | Mate, X_WN: Pose, passes: int) -> _Readings:
+        targets = target_points(part.targets, part, cell)
+        at_W, X_TW = X_WN.apply(targets.xyz_mm), pose_from_vector(cell.tracker.station_pose).inverse()
+        noise = X_TW.R.T @ noise_of(cell).covariance(X_TW.apply(at_W)) @ X_TW.R / passes
+        nominal = X_WN.R @ targets.cov_mm2 @ X_WN.R.T
+        return cls(at_W, noise, nominal, part.expansion_per_k * part.temperature_sigma_k)
 
 
-def _thermal(arms_mm: Array, sigma_expansion: float) -> Array:
-    """Covariance (f, 3, 3) of an unknown uniform expansion about the targets' centre, where the fit holds the part."""
-    grown = arms_mm * sigma_expansion
-    result: Array = grown[:, :, None] * grown[:, None, :]
-    return result
+def _part_covs(readings: _Readings, features_W_mm: Array) -> tuple[Array, Array, Array]:
+    """Covariances (f, 3, 3) that the fit of one part gives the features: by noise, by nominal nests, by temperature.
+
+    The weighted fit [rotation, translation, expansion] has the gain G = P A^T S^-1, P = (A^T S^-1 A + L)^-1, with the
+    prior L of the expansion alone; S = noise + nominal. Then P = G noise G^T + G nominal G^T + P L P.
+    """
+    both = readings.noise_mm2 + readings.nominal_mm2
+    centre = weighted_centroid(readings.xyz_mm, both)
+    free = 7 if readings.expansion > 0.0 else 6
+    scale = (1.0 / spread(readings.xyz_mm).long_mm) ** np.array([1, 1, 1, 0, 0, 0, 1])[:free]
+    jac = design(readings.xyz_mm, centre)[:, :, :free] * scale
+    weighted = jac.transpose(0, 2, 1) @ np.linalg.inv(both)
+    prior = np.zeros((free, free))
+    if free == 7:
+        prior[6, 6] = (scale[6] / readings.expansion) ** 2
+    inverse = np.linalg.inv((weighted @ jac).sum(axis=0) + prior)
+    gain = inverse @ weighted
+    back = gain.transpose(0, 2, 1)
+    reach = design(features_W_mm, centre)[:, :, :free] * scale
+    parts = ((gain @ readings.noise_mm2 @ back).sum(axis=0), (gain @ readings.nominal_mm2 @ back).sum(axis=0))
+    noise, nominal, thermal = (reach @ cov @ reach.transpose(0, 2, 1) for cov in (*parts, inverse @ prior @ inverse))
+    return noise, nominal, thermal
 
 
 def _largest_sigma(cov_mm2: Array) -> Array:

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from docking.config.base import Model
 from docking.config.cell import CellFile
-from docking.config.check import check_cell, check_job
+from docking.config.cross_check import check_cell, check_job
 from docking.config.document import cell_document_findings, job_document_findings
 from docking.config.findings import Finding, errors_of
 from docking.config.job import JobFile

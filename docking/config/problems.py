@@ -149,7 +149,7 @@ def _model_at(model: type[BaseModel], loc: Loc, doc: Any) -> type[BaseModel] | N
         doc = _child(doc, part)
         if isinstance(part, str):
             fields = [c.model_fields[part].annotation for c in candidates if part in c.model_fields]
-            candidates = [m for annotation in fields for m in _models_in(annotation)]
+            candidates = [m for annotation in fields for m in models_in(annotation)]
     kind = doc.get("kind") if isinstance(doc, Mapping) else None
     for candidate in candidates:
         field = candidate.model_fields.get("kind")
@@ -158,7 +158,8 @@ def _model_at(model: type[BaseModel], loc: Loc, doc: Any) -> type[BaseModel] | N
     return None
 
 
-def _models_in(annotation: Any) -> list[type[BaseModel]]:
+def models_in(annotation: Any) -> list[type[BaseModel]]:
+    """The models that a field annotation may hold: `tuple[Ball, ...]` -> [Ball], a union -> its members."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
-    return [m for arg in get_args(annotation) for m in _models_in(arg)]
+    return [m for arg in get_args(annotation) for m in models_in(arg)]

@@ -33,13 +33,15 @@ def rank_findings(cell: CellFile) -> list[Finding]:
     driven = ", ".join(name for name, on in zip(cell.axis_names, cell.driven, strict=True) if on) or "none"
     if found.redundancy < 0:
         text = f"{6 + found.redundancy} driven axes ({driven}); six or more are needed"
-    elif not np.isfinite(found.condition):
-        text = f"the driven axes ({driven}) are rank-deficient: some motion of the component is held by none of them"
+    elif not found.sigma_min > settings.sigma_min:
+        text = (
+            f"the driven axes ({driven}) are rank-deficient, or nearly: some motion of the component is held by "
+            f"none; least singular value {found.sigma_min:.3g}, limit {settings.sigma_min:g}"
+        )
     else:
         text = (
             f"the driven axes ({driven}) hold the component badly: condition {found.condition:.3g}, limit "
-            f"limits.condition_max = {settings.condition_max:g}; least singular value {found.sigma_min:.3g}, "
-            f"limit {settings.sigma_min:g}"
+            f"limits.condition_max = {settings.condition_max:g}"
         )
     return [*findings, error("positioners", text)]
 
