@@ -18,7 +18,7 @@ from docking.planning.settings import PlanSettings
 from docking.planning.time_law import TimeLaw, quintic, s_curve
 from docking.types import Array
 
-_SAMPLES = 256
+_SAMPLES = 257
 _GUARD = 1.0002
 """Stretch that covers what peaks between two samples of the law."""
 _LEAST_PERIODS = 4
