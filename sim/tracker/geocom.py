@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sim.tracker.crc import checksum
 from sim.tracker.optics import Optics, Shot
 from sim.wires.pacing import DeviceEnd
 
@@ -55,16 +56,6 @@ class GeocomFaults:
     """replies end without their line feed"""
     bad_crc: bool = False
     """replies in the checksum form carry a wrong one"""
-
-
-def checksum(text: str) -> int:
-    """CRC-16/ARC of ASCII text, bit by bit."""
-    register = 0
-    for byte in text.encode("ascii"):
-        for bit in range(8):
-            feedback = (register ^ (byte >> bit)) & 1
-            register = register >> 1 ^ (0xA001 if feedback else 0)
-    return register
 
 
 Answer = tuple[int, tuple[str, ...]]
@@ -122,7 +113,7 @@ class GeocomStation:
         *lines, self._input = (self._input + data).split(b"\n")
         self._input = self._input[-INPUT_LIMIT:]
         for line in lines:
-            text = line.decode("ascii", "replace").strip()
+            text = line.decode("latin-1").strip()
             if text:
                 self._obey(text)
 
@@ -133,7 +124,7 @@ class GeocomStation:
             return
         params = tuple(match[6].split(",")) if match[6] else ()
         call = _Call(int(match[2]), int(match[3] or 0), match[4] is not None, params)
-        if match[4] is not None and int(match[4]) != checksum(match[1] + match[5]):
+        if match[4] is not None and int(match[4]) != checksum((match[1] + match[5]).encode("latin-1")):
             self._reply(call, BAD_CHECKSUM, (OK, ()))
             return
         self.requests += 1
@@ -201,21 +192,21 @@ class GeocomStation:
 
     def _measurement(self, call: _Call) -> None:
         """GetSimpleMea waits for the distance up to its wait time; MeasDistanceAngle starts one and waits for it."""
+        first, tail = int(call.params[0]), tuple[str, ...]()
         if call.rpc == 17017:
             self._do_measure(("1",))
-            wait_s = self._optics.measure_s
+            wait_s, tail = self._optics.measure_s, (str(first),)
         else:
-            wait_s = int(call.params[0]) / 1000.0
+            wait_s = first / 1000.0
         rest_s = min(wait_s, max(0.0, self._ready_at_s - self._loop.time()))
-        self._loop.call_later(rest_s, self._answer_measurement, call)
+        self._loop.call_later(rest_s, self._answer_measurement, call, tail)
 
-    def _answer_measurement(self, call: _Call) -> None:
+    def _answer_measurement(self, call: _Call, tail: tuple[str, ...]) -> None:
         if self._shot is None and self._loop.time() >= self._ready_at_s - 1e-9:
             self._shot = self._take_found() or self._shoot()
             if self._shot.status != "no-target":
                 self._aim_at(self._shot)
                 self._keep_distance(self._shot)
-        tail = (call.params[0],) if call.rpc == 17017 else ()
         if self._shot is None or self._shot.status == "no-target":
             self._reply(call, OK, (ANGLES_ONLY, (*self._angles(), self._text(0.0), *tail)))
             return
@@ -262,7 +253,9 @@ class GeocomStation:
         self._previous_trid = call.trid
         head = f"%R1P,{self.faults.com_code or com},{trid}"
         tail = ":" + ",".join((str(answer[0]), *answer[1]))
-        crc = f",{checksum(head + tail) ^ (1 if self.faults.bad_crc else 0)}" if call.has_crc else ""
+        crc = ""
+        if call.has_crc:
+            crc = f",{checksum((head + tail).encode('ascii')) ^ (1 if self.faults.bad_crc else 0)}"
         end = "\r" if self.faults.carriage_return_only else "\r\n"
         line = (head + crc + tail + end).encode("ascii")[: self.faults.cut_to]
         line = self._noise.randbytes(self.faults.garbage_bytes) + line

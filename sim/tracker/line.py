@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sim.tracker.crc import checksum
 from sim.tracker.optics import Array, Optics, Shot
 from sim.wires.pacing import DeviceEnd
 
@@ -50,16 +51,6 @@ class LineFaults:
     """bits added to the flags of a point"""
     clear_flags: int = 0
     """bits removed from the flags of a point"""
-
-
-def checksum(text: bytes) -> int:
-    """CRC-16 with generator x^16 + x^15 + x^2 + 1, least significant bit first, start value 0 (ARC), bit by bit."""
-    register = 0
-    for byte in text:
-        for bit in range(8):
-            feedback = (register ^ (byte >> bit)) & 1
-            register = register >> 1 ^ (0xA001 if feedback else 0)
-    return register
 
 
 class LineTrackerDevice:

@@ -20,7 +20,8 @@ from docking.errors import (
 )
 from docking.types import Array, Identity, Reading
 from drivers.line_tracker import LineTracker
-from sim.tracker.line import LineTrackerDevice, checksum
+from sim.tracker.crc import checksum
+from sim.tracker.line import LineTrackerDevice
 from sim.virtual_time import run_virtual
 from sim.wires.virtual_serial import VirtualSerial
 from tests.fakes.tracker_optics import POINTS, FakeOptics

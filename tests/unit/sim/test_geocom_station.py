@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim.tracker.geocom import GeocomStation, checksum
+from sim.tracker.crc import checksum
+from sim.tracker.geocom import GeocomStation
 from sim.virtual_time import run_virtual
 from tests.fakes.tracker_optics import FakeOptics
 
@@ -37,7 +38,7 @@ def talk(*items: str | bytes | float, optics: FakeOptics | None = None) -> list[
             if isinstance(item, float):
                 await asyncio.sleep(item)
             else:
-                wire.on_bytes(item if isinstance(item, bytes) else item.encode() + b"\r\n")
+                wire.on_bytes(item if isinstance(item, bytes) else item.encode("latin-1") + b"\r\n")
         await asyncio.sleep(0.1)
         return wire.sent
 
@@ -120,10 +121,17 @@ def test_search_and_distance_share_one_draw() -> None:
     assert len(optics.shots) == 3
 
 
+def test_distance_and_angles_in_one_call() -> None:
+    replies = talk(AIM_N1, "%R1Q,9037,4:0.02,0.02,0", "%R1Q,17017,5:2", 3.0, "%R1Q,17017,6:\xb2", "%R1Q,17017,7:")
+    assert values(replies[2])[0] == 0
+    assert values(replies[2])[3:] == [pytest.approx(4.222875, abs=1e-6), 2.0]
+    assert replies[3:] == ["%R1P,0,6:2", "%R1P,0,7:2"]
+
+
 def test_checksum_form() -> None:
-    good = checksum("%R1Q,5003,7:")
+    good = checksum(b"%R1Q,5003,7:")
     reply = talk(f"%R1Q,5003,7,{good}:")[0]
-    assert reply == f"%R1P,0,7,{checksum('%R1P,0,7:0,366001')}:0,366001"
+    assert reply == f"%R1P,0,7,{checksum(b'%R1P,0,7:0,366001')}:0,366001"
     assert talk(f"%R1Q,5003,7,{good ^ 1}:")[0].startswith("%R1P,3101,7,")
 
 

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim.tracker.line import LineTrackerDevice, checksum
+from sim.tracker.crc import checksum
+from sim.tracker.line import LineTrackerDevice
 from sim.virtual_time import run_virtual
 from tests.fakes.tracker_optics import FakeOptics
 
