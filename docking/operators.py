@@ -112,7 +112,7 @@ WORDS = {
         "deviation": "measured deviation of the docking features (mm):",
         "sigma": "sigma",
         "tolerance": "tolerance",
-        "move": "planned move: {kind} to {stage}, {duration:.0f} s, limited by {limit}; displacement of each axis (mm):",
+        "move": "planned move: {kind} to {stage}, {duration:.0f} s, limited by {limit}; axis displacements (mm):",
     },
     "zh": {
         "keys": "按键:h 保持,r 继续,a 中止(均需回车)。急停为硬接线,不在此处。",

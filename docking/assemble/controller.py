@@ -10,6 +10,7 @@ import numpy as np
 from docking.approach import Approach, Station
 from docking.cell import Cell
 from docking.config import CellFile, JobFile
+from docking.config.budget import noise_of
 from docking.config.build import (
     convergence_settings,
     gravity_m_s2,
@@ -18,7 +19,6 @@ from docking.config.build import (
     plan_settings,
     positioners_from,
 )
-from docking.config.budget import noise_of
 from docking.config.cell import ModbusBus
 from docking.config.nominal import ers_points, feature_points, mate_feature_points, target_points
 from docking.geometry import pose_from_vector
@@ -81,8 +81,9 @@ def _tracker(cell: CellFile, link: SerialLink) -> Tracker:
         one: Array = noise.covariance(p_T_mm)[0]
         return one
 
-    driver = {"line": LineTracker, "geocom": GeocomTracker}[cell.tracker.protocol]
-    return driver(link, cell.tracker, covariance)
+    if cell.tracker.protocol == "geocom":
+        return GeocomTracker(link, cell.tracker, covariance)
+    return LineTracker(link, cell.tracker, covariance)
 
 
 def _motion(cell: CellFile, positioners: Positioners, wires: Wires) -> Motion:

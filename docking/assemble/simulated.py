@@ -103,7 +103,7 @@ async def real_wires(cell: CellFile, far: FarEnd, folder: Path) -> dict[str, Any
         addresses = {p.name: ("127.0.0.1", 0) for p in cell.positioners}
         found["modbus"] = {name: list(at) for name, at in (await far.plcs(cell, addresses)).items()}
         return found
-    bus = UnixCanServer(far.loop, folder / "can.sock", cell.bus.bitrate)
+    bus = UnixCanServer(folder / "can.sock")
     await bus.open()
     far.drives(cell, bus)
     far.devices.append(bus)
