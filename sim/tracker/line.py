@@ -68,7 +68,7 @@ class LineTrackerDevice:
         self._previous: tuple[int, str] | None = None
         wire.on_bytes = self._receive
 
-    def stop(self) -> None:
+    def close(self) -> None:
         """Abandon what runs."""
         for timer in self._timers:
             timer.cancel()
@@ -88,7 +88,7 @@ class LineTrackerDevice:
         if kind == "VER" and not fields:
             self._send("IDN", seq, PROTOCOL, *IDENTITY)
         elif kind == "STP" and not fields:
-            self.stop()
+            self.close()
             self._send("ACK", seq)
         elif kind == "GET" and len(fields) == 1:
             self._recall(seq, fields[0])
@@ -111,7 +111,7 @@ class LineTrackerDevice:
         if not _TARGET.fullmatch(target) or not re.fullmatch(r"[1-9]\d?", count) or face not in ("1", "2"):
             self._send("ERR", seq, BAD_ARGUMENT, "target, count 1..99 or face")
             return
-        self.stop()
+        self.close()
         duration_s = int(count) * self._optics.measure_s + self.faults.late_s
         finish = self._loop.call_later(duration_s, self._finish, seq, target, int(count), int(face))
         self._timers = [finish, self._loop.call_later(HEARTBEAT_S, self._beat)]
@@ -125,7 +125,7 @@ class LineTrackerDevice:
         return round(self._loop.time() * 1e6)
 
     def _finish(self, seq: int, target: str, count: int, face: int) -> None:
-        self.stop()
+        self.close()
         shots = [self._optics.shoot(target, self._loop.time(), face) for _ in range(count)]
         if any(shot.status == "no-target" for shot in shots):
             self._send("ERR", seq, NO_TARGET, "no reflector found")

@@ -52,8 +52,9 @@ class PtySerial:
         self._loop.add_reader(self._master, self._readable)
 
     def write(self, data: bytes) -> None:
-        """Send bytes to the client at the pace of the line."""
-        self._to_client.send(data)
+        """Send bytes to the client at the pace of the line; lost when the terminal is closed."""
+        if self._master >= 0:
+            self._to_client.send(data)
 
     def close(self) -> None:
         """Take the terminal away; a client that has it open meets an input/output error, as with a pulled cable."""

@@ -204,3 +204,5 @@ async def test_what_a_sleeping_client_cannot_take_is_lost_not_blocking() -> None
     await until(lambda: terminal.lost_bytes > 0)
     os.close(client)
     terminal.close()
+    terminal.write(b"a device may still speak when its wire is gone")
+    await asyncio.sleep(0.01)

@@ -124,7 +124,7 @@ def test_search_and_distance_share_one_draw() -> None:
 def test_distance_and_angles_in_one_call() -> None:
     replies = talk(AIM_N1, "%R1Q,9037,4:0.02,0.02,0", "%R1Q,17017,5:2", 3.0, "%R1Q,17017,6:\xb2", "%R1Q,17017,7:")
     assert values(replies[2])[0] == 0
-    assert values(replies[2])[3:] == [pytest.approx(4.222875, abs=1e-6), 2.0]
+    assert values(replies[2])[3:] == [pytest.approx(math.hypot(4.123456, 0.87605, 0.25), abs=1e-9), 2.0]
     assert replies[3:] == ["%R1P,0,6:2", "%R1P,0,7:2"]
 
 

@@ -47,7 +47,7 @@ def talk(*items: bytes | float, optics: FakeOptics | None = None) -> list[tuple[
                 wire.on_bytes(item)
             else:
                 await asyncio.sleep(item)
-        device.stop()
+        device.close()
         return wire.sent
 
     return run_virtual(main)
