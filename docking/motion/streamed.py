@@ -121,9 +121,9 @@ class StreamedMotion:
 
     def _judge(self, feedback: Feedback, move: _Move | None) -> DockingError | None:
         if move is None:
-            if feedback is self._judged:
+            before, self._judged = self._judged, feedback
+            if before is not None and _same(before, feedback) and self._history[0] is self._setpoint:
                 return None
-            self._judged = feedback
             return self._watch.evaluate(feedback, self._history[0], 0.0)
         # A read-back belongs to the set-point of two cycles ago: one cycle on the bus, one until the drive applies it.
         speed = move.playback.speed_at(move.playback.path_time_s)
@@ -151,3 +151,14 @@ class StreamedMotion:
         self._move = None
         if not move.done.done():
             move.done.set_result(result)
+
+
+def _same(before: Feedback, now: Feedback) -> bool:
+    """True when a driver passed the same values on: at rest, what was judged a cycle ago needs no second judgement."""
+    return (
+        now.position_mm is before.position_mm
+        and now.following_error_mm is before.following_error_mm
+        and now.force_n is before.force_n
+        and now.age_cycles is before.age_cycles
+        and now.fault is before.fault
+    )

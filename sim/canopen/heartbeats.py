@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Callable
 
 from sim.canopen.node import Node
@@ -30,7 +31,9 @@ class Heartbeats:
 
     def produce(self, node: Node, interval_s: float) -> None:
         """A node's own heartbeat was set; 0 stops it."""
-        node.next_beat_s = self._loop.time() + interval_s if interval_s > 0.0 else None
+        # Nodes with the same interval beat together: one batch on the bus instead of one a node.
+        beats = math.floor(self._loop.time() / interval_s) + 1 if interval_s > 0.0 else 0
+        node.next_beat_s = beats * interval_s if beats else None
         self._schedule()
 
     def forget(self, index: int) -> None:
