@@ -271,3 +271,42 @@ def test_one_face_only() -> None:
             await bench.tracker.measure("N1", NEAR["N1"], 2)
 
     on_bench(scenario, two_face=False)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_no_single_bit_flip_gives_a_wrong_point(which: int) -> None:
+    """Every bit of one of the two replies, flipped: refused, or still the point within three sigma."""
+
+    async def scenario(bench: Bench) -> None:
+        bench.optics.measure_s = 0.0
+        await bench.tracker.measure("N1", NEAR["N1"])
+        send, state = bench.wire.to_host.send, {"bit": 0, "reply": 0, "length": 1}
+
+        def flip(data: bytes) -> None:
+            if data.count(b",") == 5:
+                if state["reply"] == which:
+                    state["length"] = len(data)
+                    at, bit = divmod(state["bit"], 8)
+                    data = data[:at] + bytes([data[at] ^ 1 << bit]) + data[at + 1 :]
+                state["reply"] += 1
+            send(data)
+
+        bench.wire.to_host.send = flip  # type: ignore[method-assign]
+        taken = refused = 0
+        while state["bit"] < 8 * state["length"]:
+            state["reply"] = 0
+            # Each time another target, so that a frozen sensor is not the reason for a refusal.
+            name = ("N1", "N2")[state["bit"] % 2]
+            try:
+                reading = await bench.tracker.measure(name, NEAR[name])
+            except (BadReply, DeviceSilent, DeviceRefused, TargetLost):
+                refused += 1
+            else:
+                taken += 1
+                off_mm = np.abs(reading.p_T_mm - POINTS[name])
+                assert np.all(off_mm <= 3.0 * np.sqrt(np.diag(reading.cov_mm2))), state["bit"]
+            state["bit"] += 1
+        assert refused > 200
+        assert taken > 50  # the last digits of a number may differ by less than the noise
+
+    on_bench(scenario, measure_timeout_s=3.0)
