@@ -1,0 +1,296 @@
+"""Tables of the report: plain rows computed from the journal's records."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable
+from typing import Any, Final
+
+from docking.report.run import Body, Move, Record, Run
+from docking.report.words import number, plain
+
+Row = dict[str, Any]
+
+PLAN_KEYS: Final = ("plan_hash", "stage", "kind", "duration_s", "speed_limited_by", "chord_error_mm")
+
+
+def at(values: Any, index: int) -> Any:
+    """Item `index` of a list, the value itself where one value serves all, None where there is none."""
+    if isinstance(values, list):
+        return values[index] if index < len(values) else None
+    return values
+
+
+def numeric(value: Any) -> float:
+    """A number of a record as a float; NaN for everything that is none."""
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
+
+
+def largest(values: Any) -> float:
+    """The largest magnitude in a list; NaN when it holds no number."""
+    found = [abs(numeric(value)) for value in values or () if not math.isnan(numeric(value))]
+    return max(found, default=math.nan)
+
+
+def length(vector: Any) -> float:
+    """Euclidean length of a list of numbers; NaN when one is missing."""
+    return math.sqrt(math.fsum(numeric(value) ** 2 for value in vector)) if vector else math.nan
+
+
+def natural(name: str) -> list[tuple[int, str]]:
+    """Sort key that puts T2 before T10."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", name) if part]
+
+
+def by_letter(limits: dict[str, Any]) -> Row:
+    """The smallest limit of the axes with the same letter (the part of the name after the last dot)."""
+    found: Row = {}
+    for axis, limit in limits.items():
+        letter = axis.rpartition(".")[2]
+        found[letter] = min(numeric(limit), found.get(letter, math.inf))
+    return found
+
+
+def feature_rows(body: Body) -> list[Row]:
+    """One row a feature of a `features` record; `inside` is e + 2 sigma <= tolerance and fails on unknown numbers."""
+    rows = []
+    for i, name in enumerate(body.get("names") or ()):
+        vector = at(body.get("error_mm"), i) or [None] * 3
+        e, sigma = length(vector), numeric(at(body.get("sigma_mm"), i))
+        tolerance = numeric(at(body.get("tolerance_mm"), i))
+        rows.append(
+            {
+                "name": name,
+                "d_mm": vector,
+                "e_mm": e,
+                "sigma_mm": sigma,
+                "e2s_mm": e + 2.0 * sigma,
+                "tolerance_mm": tolerance,
+                "margin_mm": tolerance - e - 2.0 * sigma,
+                "inside": e + 2.0 * sigma <= tolerance,
+            }
+        )
+    return rows
+
+
+def stage_rows(run: Run) -> list[Row]:
+    """For each stage in order: every feature before the first and after the last move of the stage."""
+    stages: dict[str, dict[str, list[Row]]] = {}
+    for body in run.bodies("features"):
+        stage = stages.setdefault(str(body.get("stage")), {})
+        if body.get("when") == "before":
+            stage.setdefault("before", feature_rows(body))
+        else:
+            stage["after"] = feature_rows(body)
+    return [{"stage": name, "rows": _paired(stage)} for name, stage in stages.items()]
+
+
+def _paired(stage: dict[str, list[Row]]) -> list[Row]:
+    before = {row["name"]: row for row in stage.get("before", ())}
+    after = {row["name"]: row for row in stage.get("after", ())}
+    names = dict.fromkeys([*before, *after])
+    return [{"name": name, "before": before.get(name), "after": after.get(name)} for name in names]
+
+
+def check_rows(body: Body) -> list[Row]:
+    """One row a check point: its error vector, length, limit and whether it agrees."""
+    rows = []
+    for i, name in enumerate(body.get("names") or ()):
+        vector = at(body.get("error_mm"), i)
+        e = length(vector) if isinstance(vector, list) else abs(numeric(vector))
+        limit = numeric(at(body.get("limit_mm"), i))
+        rows.append({"name": name, "e_mm": e, "limit_mm": limit, "agrees": e <= limit})
+    return rows
+
+
+def fit_rows(run: Run) -> list[Row]:
+    """Every station check and fit in the order they were made."""
+    rows = []
+    for record in run.records:
+        if record["kind"] not in ("station", "fit"):
+            continue
+        body = record["body"]
+        used = body.get("used")
+        rows.append(
+            {
+                "age_s": run.age_s(record),
+                "what": body.get("what", "station"),
+                "stage": body.get("stage") or "",
+                "method": body.get("method") or "",
+                "iterations": body.get("iterations"),
+                "used": len(used) if isinstance(used, list) else used or len(body.get("residuals_mm") or ()),
+                "rejected": len(body.get("rejected") or ()),
+                "rms_mm": body.get("rms_mm"),
+                "max_mm": body.get("max_mm"),
+                "pose": body.get("pose") or pose_of(body.get("X_WT")),
+            }
+        )
+    return rows
+
+
+def pose_of(matrix: Any) -> Row:
+    """Translation (mm) and angles (deg) of a 4x4 matrix, R = Rz(gamma) Ry(beta) Rx(alpha); {} when there is none."""
+    if not matrix:
+        return {}
+    r = [[numeric(value) for value in row] for row in matrix]
+    return {
+        "x_mm": r[0][3],
+        "y_mm": r[1][3],
+        "z_mm": r[2][3],
+        "alpha_deg": math.degrees(math.atan2(r[2][1], r[2][2])),
+        "beta_deg": math.degrees(math.atan2(-r[2][0], math.hypot(r[0][0], r[1][0]))),
+        "gamma_deg": math.degrees(math.atan2(r[1][0], r[0][0])),
+    }
+
+
+def rejection_rows(run: Run) -> list[Row]:
+    """Every point thrown out: when, in which fit, which, why."""
+    rows = []
+    for record in run.records:
+        if record["kind"] not in ("station", "fit"):
+            continue
+        body = record["body"]
+        where = f"{body.get('what', 'station')} {body.get('stage') or ''}".strip()
+        for item in body.get("rejected") or ():
+            point = item if isinstance(item, dict) else {"name": item}
+            rows.append({"age_s": run.age_s(record), "where": where, **point})
+    return rows
+
+
+def residual_groups(run: Run) -> list[tuple[str, dict[str, list[float]]]]:
+    """Residuals (name: [dx, dy, dz] mm) of the last station check, mate fit and component fit that exist."""
+    found = {"station": run.last("station").get("residuals_mm")}
+    for body in run.bodies("fit"):
+        found[str(body.get("what"))] = body.get("residuals_mm")
+    groups = []
+    for what, residuals in found.items():
+        if residuals:
+            names = sorted(residuals, key=natural)
+            groups.append((what, {name: [numeric(v) for v in residuals[name]] for name in names}))
+    return groups
+
+
+def measurement_rows(run: Run) -> list[Row]:
+    """One row a group of measurements: how many, of how many points, and the largest sigma of a coordinate."""
+    groups: dict[str, list[Body]] = {}
+    for body in run.bodies("measurement"):
+        groups.setdefault(str(body.get("group")), []).extend(body.get("readings") or ())
+    return [
+        {
+            "group": group,
+            "readings": len(readings),
+            "points": len({reading.get("target") for reading in readings}),
+            "sigma_mm": largest([s for reading in readings for s in reading.get("sigma_mm") or ()]),
+        }
+        for group, readings in groups.items()
+    ]
+
+
+def plan_rows(run: Run) -> list[Row]:
+    """One row a plan: what limits it, its smallest margins, whether it was confirmed and how it ended."""
+    confirmed = {body.get("plan_hash"): body.get("go") for body in run.bodies("confirm")}
+    ended = {body.get("plan_hash"): body.get("result") for body in run.bodies("moved")}
+    rows = []
+    for count, body in enumerate(run.bodies("plan"), start=1):
+        correction = body.get("correction") or {}
+        margins = body.get("margins") or []
+        rows.append(
+            {
+                **{key: body.get(key) for key in PLAN_KEYS},
+                "number": body.get("plan_id", count),
+                "shift_mm": length(correction.get("shift_mm")),
+                "rotation_deg": length(correction.get("rotvec_deg")),
+                "stroke_margin": _smallest(margins, 1, "mm"),
+                "speed_margin": _smallest(margins, 2, "mm/s"),
+                "confirmed": confirmed.get(body.get("plan_hash")),
+                "result": ended.get(body.get("plan_hash")),
+            }
+        )
+    return rows
+
+
+def _smallest(margins: Iterable[list[Any]], column: int, unit: str) -> str:
+    known = [(numeric(row[column]), row[0]) for row in margins if not math.isnan(numeric(at(row, column)))]
+    if not known:
+        return number(None)
+    value, axis = min(known)
+    return f"{number(value, 2)} {unit} ({axis})"
+
+
+def displacement_blocks(moves: list[Move], axes: list[str], width: int = 9) -> list[Row]:
+    """Axis displacements of the executed moves in blocks of at most `width` moves."""
+    blocks = []
+    for first in range(0, len(moves), width):
+        block = moves[first : first + width]
+        rows = []
+        for axis in axes:
+            values = [(move.plan.get("displacement_mm") or {}).get(axis) for move in block]
+            rows.append({"axis": axis, "values": values})
+        blocks.append({"moves": block, "rows": rows, "ends": [end_difference(move) for move in block]})
+    return blocks
+
+
+def end_difference(move: Move) -> float:
+    """Largest |read-back displacement - planned displacement| of a finished move in mm; NaN where unknown."""
+    trace = move.moved.get("trace") or {}
+    positions, planned = trace.get("position_mm") or {}, move.plan.get("displacement_mm") or {}
+    if not numeric(at((trace.get("path_time_s") or [])[-1:], 0)) >= 0.999 * numeric(move.plan.get("duration_s")):
+        return math.nan
+    return largest(
+        [
+            numeric(track[-1]) - numeric(track[0]) - numeric(planned.get(axis))
+            for axis, track in positions.items()
+            if track
+        ]
+    )
+
+
+def maxima_rows(moves: list[Move]) -> list[Row]:
+    """One row an executed move: its largest following error (and axis), residual and internal force."""
+    rows = []
+    for move in moves:
+        errors = move.moved.get("max_following_error_mm") or {}
+        worst = max(errors, key=lambda axis: abs(numeric(errors[axis])), default=None)
+        rows.append(
+            {
+                "number": move.number,
+                "stage": move.plan.get("stage") or "",
+                "kind": move.plan.get("kind") or "",
+                "result": move.moved.get("result"),
+                "following_error_mm": errors.get(worst),
+                "axis": worst or "",
+                "residual_mm": move.moved.get("max_consistency_residual_mm"),
+                "force_n": move.moved.get("max_internal_force_n"),
+            }
+        )
+    return rows
+
+
+def event_rows(run: Run, words: dict[str, str]) -> list[Row]:
+    """The time line: everything but state changes and single measurements, in one short sentence each."""
+    rows = []
+    for record in run.records:
+        template = words.get(_event_key(record))
+        if template is None:
+            continue
+        body = {key: plain(value) for key, value in record["body"].items() if not isinstance(value, dict | list)}
+        body["plan"] = str(record["body"].get("plan_hash") or "")[:8]
+        rows.append({"age_s": run.age_s(record), "seq": record["seq"], "text": _filled(template, body, words)})
+    return rows
+
+
+def _event_key(record: Record) -> str:
+    if record["kind"] == "confirm":
+        return "event_confirm_go" if record["body"].get("go") is True else "event_confirm_abort"
+    return f"event_{record['kind']}"
+
+
+def _filled(template: str, values: dict[str, str], words: dict[str, str]) -> str:
+    class Known(dict[str, str]):
+        def __missing__(self, key: str) -> str:
+            return plain(None)
+
+    prefix = {"when": "", "what": "fit_", "outcome": "outcome_"}
+    translated = {key: words.get(f"{prefix[key]}{values[key]}", values[key]) for key in prefix if key in values}
+    return template.format_map(Known(values | translated))
