@@ -56,8 +56,9 @@ def reference_shift(X_WT: Pose, reference: Points, readings: Points, sigmas: flo
     """Test whether reference points (ERS or mate targets) still read as they did when the station was located.
 
     `reference` (W): their places then, best `to_world(X_WT, first readings)`, so that errors of nominal values cancel;
-    `readings` (T): now, in one or more passes, of which ALL count: a reading that disagrees is a sign, not noise. Two tests, each at the two-sided probability of `sigmas` (3: 0.27 %): the
-    common shift (all points together) and each single point. Not measurable counts as moved: a NaN fails both.
+    `readings` (T): now, in one or more passes, of which ALL count: one that disagrees is a sign, not noise.
+    Two tests, each at the two-sided probability of `sigmas` (3: 0.27 %): the common shift (all points together) and
+    each single point. Not measurable counts as moved: a NaN fails both.
     Raises TooFewPoints under three common points, SigmaMissing where a covariance is not known.
     """
     rows = {name: i for i, name in enumerate(reference.names)}

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from docking.errors import NotCongruent
-from docking.geometry import euler_to_matrix, exp_so3, matrix_to_euler, skew
+from docking.geometry import euler_to_matrix, exp_so3, skew
 from docking.pose.three_point import fit_three_point
 from docking.types import Array, Pose
 
@@ -55,22 +55,25 @@ def fit_gauss_newton(nominal_mm: Array, measured_mm: Array, start: Pose | None =
     """Equal-weight minimum of [Luo] Eq. 9 by Gauss-Newton, Eq. 12, from the three-point pose; with its iterations.
 
     The points are centred and the angles scaled by the rms radius, so the system is well conditioned at any distance.
+    The angles count from a base rotation, at first the start's, that follows when beta grows: no gimbal lock is met.
     """
     j0, p0 = nominal_mm.mean(axis=0), measured_mm.mean(axis=0)
     j, p = nominal_mm - j0, measured_mm - p0
     X = fit_three_point(nominal_mm, measured_mm) if start is None else start
-    euler = matrix_to_euler(X.R)
-    angles, t = np.array(euler[:3]), X.apply(j0) - p0
+    base, angles, t = X.R, np.zeros(3), X.apply(j0) - p0
     radius = float(np.sqrt(np.mean(np.sum(j * j, axis=1))))
     scale = np.array([1.0 / radius] * 3 + [1.0] * 3)
     for iteration in range(1, _MAX_ITERATIONS + 1):
-        f = j @ euler_to_matrix(*angles).T + t - p
-        a = euler_jacobian(angles[0], angles[1], angles[2], j).reshape(-1, 6) * scale
+        turned = j @ base.T
+        f = turned @ euler_to_matrix(*angles).T + t - p
+        a = euler_jacobian(angles[0], angles[1], angles[2], turned).reshape(-1, 6) * scale
         step = np.linalg.lstsq(a, -f.reshape(-1), rcond=1e-12)[0]
         angles, t = angles + step[:3] * scale[:3], t + step[3:]
         if float(np.linalg.norm(step)) < _step_limit_mm(j):
-            R = euler_to_matrix(*angles)
+            R = euler_to_matrix(*angles) @ base
             return Pose(R, p0 + t - R @ j0), iteration
+        if abs(float(angles[1])) > 1.0:
+            base, angles = euler_to_matrix(*angles) @ base, np.zeros(3)
     raise NotCongruent("fit", "Gauss-Newton does not converge", value=len(nominal_mm), limit=len(nominal_mm))
 
 

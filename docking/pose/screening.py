@@ -88,11 +88,11 @@ def _screen_pairs(pairs: Pairs, averaged: Averaged, settings: FitSettings) -> Sc
     pairs = given if graph.sigma_mm is None else _with_sigma(given, graph.sigma_mm)
     tested = snoop(pairs, graph.clique, settings.false_alarm, settings.expansion_sigma, scaled)
     _check_unique(pairs, graph, tested, settings)
-    _check_deformed(pairs, graph, tested, settings)
     if scaled:
         pairs = _with_sigma(given, _posterior_sigma_mm(pairs, tested))
     kept = pairs.rows(tested.kept)
     out = [_explain(pairs, tested, i) for i in range(len(pairs.names)) if i not in set(tested.kept)]
+    _check_deformed(out, graph, tested, settings)
     rejected = (*out, *averaged.rejected)
     return Screened(
         kept.names,
@@ -203,8 +203,17 @@ def _check_unique(pairs: Pairs, graph: _Graph, tested: Tested, settings: FitSett
         raise AmbiguousSet(settings.where, f"{first} agree among themselves, and so do {second}", value=len(rival))
 
 
-def _check_deformed(pairs: Pairs, graph: _Graph, tested: Tested, settings: FitSettings) -> None:
-    """Refuse when points would have to be deleted one after another until the rest fits: the part is deformed."""
+def _check_deformed(out: list[Rejection], graph: _Graph, tested: Tested, settings: FitSettings) -> None:
+    """Refuse when points would have to be deleted until the rest fits: most of them, or one after another.
+
+    A swapped or misplaced reflector is explained by the fit itself and does not count against it.
+    """
+    unexplained = sum(r.reason == "mis-aimed" for r in out)
+    if not (unexplained <= len(tested.kept)):
+        cause = f"{unexplained} points are off without a pattern: another or a deformed part, or sigmas too small"
+        error = NotCongruent(settings.where, cause, value=len(tested.kept), limit=unexplained)
+        error.rejected = tuple(out)
+        raise error
     allowed = max(1, len(graph.clique) // 4)
     if not (tested.snooped <= allowed):
         cause = f"{tested.snooped} points would have to go until the rest fits: deformed part, or sigmas too small"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import combinations
+from itertools import combinations, permutations
 
 import numpy as np
 
@@ -23,18 +23,21 @@ def _far_apart(points_mm: Array, count: int) -> list[int]:
 
 
 def best_triangle(points_mm: Array) -> tuple[int, int, int]:
-    """Indices (A, B, C) of the triangle with the largest area; C and A end its longest side."""
+    """Indices (A, B, C) of the triangle with the largest area; CA is its longest side, CB its second."""
     n = len(points_mm)
     pool = list(range(n)) if n <= _EXHAUSTIVE else _far_apart(points_mm, _EXHAUSTIVE)
     triples = np.array(list(combinations(pool, 3)))
     a, b, c = (points_mm[triples[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(a - c, b - c), axis=1)
-    i, j, k = (int(v) for v in triples[int(np.argmax(area))])
-    sides = [
-        (float(np.linalg.norm(points_mm[x] - points_mm[z])), x, y, z) for x, y, z in ((i, j, k), (i, k, j), (j, i, k))
-    ]
-    _, x, y, z = max(sides)
-    return x, y, z
+    corners = [int(v) for v in triples[int(np.argmax(area))]]
+    a_c_b = max((_sides(points_mm, order), order) for order in permutations(corners))[1]
+    return a_c_b[0], a_c_b[2], a_c_b[1]
+
+
+def _sides(points_mm: Array, order: tuple[int, ...]) -> tuple[float, float]:
+    """Lengths (AC, CB) of corners in the order A, C, B: their maximum gives the roles, whatever the points' order."""
+    a, c, b = (points_mm[k] for k in order)
+    return float(np.linalg.norm(a - c)), float(np.linalg.norm(b - c))
 
 
 def triangle_frame(a: Array, b: Array, c: Array) -> Pose:
