@@ -27,6 +27,7 @@ from drivers.register_map import load_map
 RESERVE_S = 1.0
 """Path time kept in the queues beyond what a stop needs."""
 PUSHES_A_POLL = 4
+PREFILL_TRIES = 10
 LAG_CYCLES = 3
 MISSES = 2
 START_MM = 0.01
@@ -147,9 +148,11 @@ class ModbusPositioners:
             raise SegmentRejected(self.axes[worst], cause, value=6)
 
     async def _prefill(self, plc: PositionerPlc) -> None:
-        await plc.push()
-        while plc.waiting and plc.depth < self._depth:
+        for _ in range(PREFILL_TRIES * self._depth):
+            if not plc.waiting or plc.depth >= self._depth:
+                return
             await self._push_or_look(plc)
+        raise SegmentRejected(plc.where, f"it acknowledged only {plc.pushed} segments", value="silent")
 
     @staticmethod
     async def _push_or_look(plc: PositionerPlc) -> None:

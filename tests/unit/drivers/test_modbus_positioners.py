@@ -454,6 +454,16 @@ def test_bring_up_proves_identity_word_order_settings_and_strokes() -> None:
     bring_up_raises(ReadBackMismatch, "positioner D, stroke of Z", other_stroke)
 
 
+def test_a_plc_that_ignores_segments_ends_the_loading() -> None:
+    async def scenario(bench: Bench) -> None:
+        await bench.start()
+        bench.group.plcs[1]._take_segment = lambda data: None  # type: ignore[method-assign]
+        with pytest.raises(SegmentRejected, match="positioner B.*only 0 segments"):
+            await bench.driver.load(bench.plan)
+
+    play(scenario)
+
+
 def test_a_refused_command_names_the_reason() -> None:
     async def scenario(bench: Bench) -> None:
         await bench.start()
