@@ -15,6 +15,7 @@ import numpy as np
 from docking import records
 from docking.approach import Approach, Station
 from docking.errors import (
+    CheckPointDisagrees,
     DockingError,
     FitResidual,
     FrameImplausible,
@@ -30,6 +31,9 @@ from docking.pose import check_points_agree, fit_pose, screen
 from docking.state import Effect, Event
 from docking.survey import Survey
 from docking.types import Alarm, Array, FeatureErrors, Fit, Plan, Pose
+
+FEWEST_CHECK_POINTS = 2
+"""Check points that must remain and agree when one is set aside."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,12 +160,14 @@ class Procedure:
         return Event.FITTED
 
     def _check_against_axes(self, fit: Fit) -> None:
-        """The fitted pose must put the balls where the axes say the loaded sockets are: catches swapped axes, frames."""
+        """The fitted pose must put the balls where the axes say the loaded sockets are: finds swapped axes and frames."""
         positioners, load, X_WC = self._settings.positioners, self._settings.plan.load, fit.X_MN
         balls = X_WC.apply(positioners.balls_C_mm)
         weight = load.mass_kg * load.gravity_m_s2
         reactions = ball_reactions_n(positioners, balls, X_WC.apply(load.com_C_mm), weight)[0]
-        loaded = figure_residual_mm(positioners, self.motion.feedback().position_mm, X_WC) + sink_mm(positioners, reactions)
+        loaded = figure_residual_mm(positioners, self.motion.feedback().position_mm, X_WC) + sink_mm(
+            positioners, reactions
+        )
         gaps = np.linalg.norm(loaded, axis=1)
         worst = int(np.argmax(gaps))
         if not (gaps[worst] <= self._settings.plausibility_mm):
@@ -181,7 +187,8 @@ class Procedure:
             f"{station.name}: {errors.names[i]} is off by {errors.norm_mm[i]:.3f} mm "
             f"(sigma {errors.sigma_mm[i]:.3f}, tolerance {errors.tolerance_mm[i]:.3f})"
         )
-        self._check_check_points(fit)
+        if not self._check_points_agree(fit):
+            return Event.MEASURE_MORE
         if station is self._approach.stations[-1]:
             return self._judge_contact(station)
         if float(errors.norm_mm[i]) <= self._approach.close_enough_mm(station, float(errors.sigma_mm[i])):
@@ -216,14 +223,35 @@ class Procedure:
         p.corrections, p.kind = p.corrections + 1, "align"
         return Event.MOVE_NEEDED
 
-    def _check_check_points(self, fit: Fit) -> None:
-        """Points kept out of the fit must lie where the fit says; they see what the fit's own residuals cannot."""
+    def _check_points_agree(self, fit: Fit) -> bool:
+        """Points kept out of the fit must lie where the fit says; they see what the fit's own residuals cannot.
+
+        False asks for more passes: measuring moves nothing, and one bad reading must not end a docking. A single point
+        that is grossly off while two or more agree is a reflector that does not sit, named and set aside.
+        Raises CheckPointDisagrees when the passes are spent.
+        """
         nominal, seen = self._survey.check_points()
         if not len(seen):
-            return
-        off = check_points_agree(fit, nominal, seen)
+            return True
+        try:
+            off = check_points_agree(fit, nominal, seen)
+        except CheckPointDisagrees as error:
+            gross = isinstance(error.value, float) and error.value > self._settings.target_residual_mm
+            if gross and len(seen) > FEWEST_CHECK_POINTS:
+                self._set_aside(error)
+                return self._check_points_agree(fit)
+            if self.progress.passes < self._approach.convergence.max_passes:
+                return False
+            raise
         errors = np.linalg.norm(off, axis=1).tolist()
         self.journal.write("check_points", {"names": list(seen.names), "error_mm": errors, "limit_mm": None})
+        return True
+
+    def _set_aside(self, error: CheckPointDisagrees) -> None:
+        self._survey.leave_out(error.where)
+        self.progress.rejected.add(error.where)
+        self.journal.write("set_aside", {"name": error.where, "error_mm": error.value, "limit_mm": error.limit})
+        self.operator.notify(error.text())
 
     async def _plan(self) -> Event:
         p, station = self.progress, self._station()

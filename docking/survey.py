@@ -7,7 +7,7 @@ and cancels in their difference; what does not cancel is drift, and that is what
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -61,7 +61,21 @@ class Survey:
     _references: dict[str, Points] = field(default_factory=dict)
 
     async def locate(self, X_WT_guess: Pose, X_WM_guess: Pose) -> None:
-        """Measure all ERS points and fit the station, then all mate targets and fit the mate."""
+        """Measure all ERS points and fit the station, then all mate targets and fit the mate.
+
+        Measuring moves nothing, so it is done again when the station moved meanwhile. Raises StationMoved when it
+        does not come to rest, and as `docking.pose.screen`.
+        """
+        for left in reversed(range(self.settings.attempts + 1)):
+            try:
+                await self._locate_once(X_WT_guess, X_WM_guess)
+                return
+            except StationMoved as moved:
+                self._note_moved(moved)
+                if left == 0:
+                    raise
+
+    async def _locate_once(self, X_WT_guess: Pose, X_WM_guess: Pose) -> None:
         guess = self.X_WT.X_MN if self.X_WT is not None else X_WT_guess
         await self._check_faces(guess)
         ers = await self._shoot("ers", self.nominals.ers, guess, Pose.identity(), self.settings.passes)
@@ -75,19 +89,30 @@ class Survey:
         self.checked_at_s = self.clock()
 
     async def measure_component(self, X_WC_guess: Pose, X_WM_guess: Pose, passes: int, *, more: bool = False) -> None:
-        """Measure targets and check points in `passes` passes, then the references; again if the station moved."""
+        """Measure targets and check points in `passes` passes, then the references; again if the station moved.
+
+        With `more` the passes join those measured before at the same place.
+        """
         for left in reversed(range(self.settings.attempts + 1)):
-            targets = await self._measure_W("component", self.nominals.targets, X_WC_guess, passes)
-            checks = await self._measure_W("check", self.nominals.checks, X_WC_guess, passes)
-            moved = await self._check_references()
-            if moved is None:
-                self.component = _joined(self.component, targets) if more and self.component else targets
+            try:
+                targets = await self._measure_W("component", self.nominals.targets, X_WC_guess, passes)
+                checks = await self._measure_W("check", self.nominals.checks, X_WC_guess, passes)
+                targets = _joined(self.component, targets) if more and self.component else targets
+                average_passes(targets, self.settings.component_fit)
+                await self._check_references()
                 self.checks = _joined(self.checks, checks) if more and self.checks else checks
+                self.component = targets
                 return
-            if left == 0:
-                raise moved
+            except StationMoved as moved:
+                self._note_moved(moved)
+                if left == 0:
+                    raise
             more = False
             await self.locate(self._station(), X_WM_guess)
+
+    def _note_moved(self, moved: StationMoved) -> None:
+        body = {"reference": moved.where, "shift_mm": moved.value, "limit_mm": moved.limit, "restationed": True}
+        self.journal.write("drift", body)
 
     def _station(self) -> Pose:
         if self.X_WT is None:
@@ -147,6 +172,16 @@ class Survey:
         seen = _averaged(self.checks, self.settings.component_fit)
         return _picked(nominal, [nominal.names.index(n) for n in seen.names]), seen
 
+    def leave_out(self, check_point: str) -> None:
+        """Measure and judge this check point no more."""
+        nominal = self.nominals.checks
+        keep = [i for i, name in enumerate(nominal.names) if name != check_point]
+        self.nominals = replace(self.nominals, checks=_picked(nominal, keep))
+        if self.checks is not None:
+            rows = [i for i, name in enumerate(self.checks.names) if name != check_point]
+            passes = tuple(self.checks.passes[i] for i in rows)
+            self.checks = replace(_picked(self.checks, rows), passes=passes)
+
     def _keep_references(self, ers: Points, mate: Points) -> None:
         """Where the references read when the station was located: their change is movement, whatever their nominal."""
         self._references = {
@@ -154,8 +189,8 @@ class Survey:
             "mate": _averaged(mate, self.settings.mate_fit),
         }
 
-    async def _check_references(self) -> StationMoved | None:
-        """Re-measure some ERS points and mate targets; the shift that is more than noise, if there is one.
+    async def _check_references(self) -> None:
+        """Re-measure some ERS points and mate targets; raises StationMoved for a shift that is more than noise.
 
         A shift has to show twice: one badly seated reflector is no reason to locate the station again.
         """
@@ -165,17 +200,11 @@ class Survey:
                 shift = await self._shift(group, nominal, X_WN)
                 if not shift.moved:
                     break
-            body = {
-                "reference": group,
-                "shift_mm": shift.worst_mm,
-                "limit_mm": shift.limit_mm,
-                "restationed": shift.moved,
-            }
-            self.journal.write("drift", body)
             if shift.moved:
-                return StationMoved(group, "seen against the references", value=shift.worst_mm, limit=shift.limit_mm)
+                raise StationMoved(group, "seen against the references", value=shift.worst_mm, limit=shift.limit_mm)
+            body = {"shift_mm": shift.worst_mm, "limit_mm": shift.limit_mm, "restationed": False}
+            self.journal.write("drift", {"reference": group, **body})
         self.checked_at_s = self.clock()
-        return None
 
     async def _shift(self, group: str, nominal: Points, X_WN: Pose) -> ReferenceShift:
         known = self._references[group]
