@@ -102,7 +102,7 @@ def limit_line(panel: Axes, limit: float, reach: float, texts: tuple[str, str]) 
         return
     look: dict[str, Any] = {"color": LIMIT, "fontsize": 8.0, "textcoords": "offset points"}
     if not reach >= 0.2 * limit:
-        panel.annotate(texts[1], (0.0, 1.0), (2.0, 2.0), xycoords="axes fraction", va="bottom", **look)
+        panel.annotate(texts[1], (0.0, 1.0), (2.0, 11.0), xycoords="axes fraction", va="bottom", **look)
         return
     low, high = panel.get_ylim()
     for line in (limit, -limit) if low < 0.0 else (limit,):

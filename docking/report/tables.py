@@ -75,32 +75,39 @@ def feature_rows(body: Body) -> list[Row]:
 
 
 def stage_rows(run: Run) -> list[Row]:
-    """For each stage in order: every feature before the first and after the last move of the stage."""
+    """For each stage in order: every feature before its first and after its last move.
+
+    A stage that was entered from the one before was last judged there, against a goal that differs by the stand-off
+    only: that judgement is its "before".
+    """
     stages: dict[str, dict[str, list[Row]]] = {}
+    newest: list[Row] = []
     for body in run.bodies("features"):
-        stage = stages.setdefault(str(body.get("stage")), {})
+        stage = stages.setdefault(str(body.get("stage")), {"earlier": newest})
+        newest = feature_rows(body)
         if body.get("when") == "before":
-            stage.setdefault("before", feature_rows(body))
+            stage.setdefault("before", newest)
         else:
-            stage["after"] = feature_rows(body)
+            stage["after"] = newest
     return [{"stage": name, "rows": _paired(stage)} for name, stage in stages.items()]
 
 
 def _paired(stage: dict[str, list[Row]]) -> list[Row]:
-    before = {row["name"]: row for row in stage.get("before", ())}
+    before = {row["name"]: row for row in stage.get("before", stage["earlier"])}
     after = {row["name"]: row for row in stage.get("after", ())}
     names = dict.fromkeys([*before, *after])
     return [{"name": name, "before": before.get(name), "after": after.get(name)} for name in names]
 
 
 def check_rows(body: Body) -> list[Row]:
-    """One row a check point: its error vector, length, limit and whether it agrees."""
+    """One row a check point: its error, limit and whether it agrees (None when no limit was recorded)."""
     rows = []
     for i, name in enumerate(body.get("names") or ()):
         vector = at(body.get("error_mm"), i)
         e = length(vector) if isinstance(vector, list) else abs(numeric(vector))
         limit = numeric(at(body.get("limit_mm"), i))
-        rows.append({"name": name, "e_mm": e, "limit_mm": limit, "agrees": e <= limit})
+        agrees = None if math.isnan(limit) and not math.isnan(e) else e <= limit
+        rows.append({"name": name, "e_mm": e, "limit_mm": limit, "agrees": agrees})
     return rows
 
 
@@ -232,7 +239,7 @@ def displacement_blocks(moves: list[Move], axes: list[str], width: int = 9) -> l
 
 
 def end_difference(move: Move) -> float:
-    """Largest |read-back displacement - planned displacement| of a finished move in mm; NaN where unknown."""
+    """Largest |read-back displacement - planned displacement| in mm; NaN when the trace does not reach the end."""
     trace = move.moved.get("trace") or {}
     positions, planned = trace.get("position_mm") or {}, move.plan.get("displacement_mm") or {}
     if not numeric(at((trace.get("path_time_s") or [])[-1:], 0)) >= 0.999 * numeric(move.plan.get("duration_s")):
@@ -275,7 +282,7 @@ def event_rows(run: Run, words: dict[str, str]) -> list[Row]:
         if template is None:
             continue
         body = {key: plain(value) for key, value in record["body"].items() if not isinstance(value, dict | list)}
-        body["plan"] = str(record["body"].get("plan_hash") or "")[:8]
+        body["plan"] = plain(record["body"].get("plan_hash"))[:8]
         rows.append({"age_s": run.age_s(record), "seq": record["seq"], "text": _filled(template, body, words)})
     return rows
 

@@ -193,7 +193,7 @@ def test_faulted_run_shows_the_alarm_and_what_to_do(tmp_path: Path) -> None:
     assert "2101 C.Z: following error 0.62 mm is over the limit 0.5 mm." in text
     assert "Look for a jam" in text
     assert "The run ended before acceptance" in text
-    assert "stopped on the way" in text
+    assert "Result stopped" in text
     assert "Docked" not in text
 
 

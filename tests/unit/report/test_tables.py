@@ -18,6 +18,7 @@ from docking.report.tables import (
     natural,
     plan_rows,
     pose_of,
+    stage_rows,
 )
 from docking.report.traces import envelope, track
 from docking.report.words import clock, css_string, number, plain, signed
@@ -42,6 +43,18 @@ def test_a_feature_is_inside_up_to_its_tolerance_and_no_further() -> None:
 def test_a_check_point_with_an_unknown_error_disagrees() -> None:
     rows = check_rows({"names": ["K1", "K2"], "error_mm": [[0.1, 0.0, 0.0], None], "limit_mm": [0.12, 0.12]})
     assert [row["agrees"] for row in rows] == [True, False]
+    assert check_rows({"names": ["K1"], "error_mm": [0.1], "limit_mm": None})[0]["agrees"] is None
+
+
+def test_a_stage_begins_with_the_last_judgement_before_it() -> None:
+    def judged(stage: str, when: str, e_mm: float) -> dict[str, object]:
+        error = {"names": ["F"], "error_mm": [[e_mm, 0, 0]], "sigma_mm": [0], "tolerance_mm": [1]}
+        return {"kind": "features", "body": {"stage": stage, "when": when, **error}}
+
+    stages = [("a", "before", 9.0), ("a", "after", 5.0), ("a", "after", 4.0), ("b", "after", 2.0)]
+    run = Run([judged(*row) for row in stages])
+    shown = [(s["stage"], s["rows"][0]["before"]["e_mm"], s["rows"][0]["after"]["e_mm"]) for s in stage_rows(run)]
+    assert shown == [("a", 9.0, 4.0), ("b", 4.0, 2.0)]
 
 
 def test_pose_of_a_matrix_uses_the_house_angles() -> None:
