@@ -15,10 +15,12 @@ import numpy as np
 from docking import records
 from docking.approach import Approach, Station
 from docking.errors import (
+    AmbiguousSet,
     CheckPointDisagrees,
     DockingError,
     FitResidual,
     FrameImplausible,
+    NotCongruent,
     PermissiveMissing,
     PlanError,
     PlanStale,
@@ -147,7 +149,14 @@ class Procedure:
 
     async def _fit(self) -> Event:
         p, survey, settings = self.progress, self._survey, self._survey.settings.component_fit
-        fit = fit_pose(screen(survey.nominals.targets, _known(survey.component, "component"), settings), settings)
+        try:
+            fit = fit_pose(screen(survey.nominals.targets, _known(survey.component, "component"), settings), settings)
+        except (NotCongruent, AmbiguousSet) as refusal:
+            # With a third reading of every point the screening can tell a bad reading from a bad point.
+            if p.passes >= 2 * survey.settings.passes:
+                raise
+            self.operator.notify(refusal.text())
+            return Event.MEASURE_MORE
         self.journal.write("fit", records.fit_record(fit, "component", self._station().name))
         p.rejected |= {r.name for r in fit.rejected}
         if not (fit.max_mm <= self._settings.target_residual_mm):
@@ -160,7 +169,7 @@ class Procedure:
         return Event.FITTED
 
     def _check_against_axes(self, fit: Fit) -> None:
-        """The fitted pose must put the balls where the axes say the loaded sockets are: finds swapped axes and frames."""
+        """The fitted pose must put the balls where the loaded sockets are: finds swapped axes and wrong frames."""
         positioners, load, X_WC = self._settings.positioners, self._settings.plan.load, fit.X_MN
         balls = X_WC.apply(positioners.balls_C_mm)
         weight = load.mass_kg * load.gravity_m_s2

@@ -139,6 +139,7 @@ TABLE: dict[tuple[State, Event], Transition] = {
     (S.MEASURE_FRAME, E.FRAME_MEASURED): Transition(S.MEASURE, (F.MEASURE,)),
     (S.MEASURE, E.MEASURED): Transition(S.FIT, (F.FIT,)),
     (S.FIT, E.FITTED): Transition(S.VERIFY, (F.JUDGE,)),
+    (S.FIT, E.MEASURE_MORE): Transition(S.MEASURE, (F.MEASURE,)),
     (S.VERIFY, E.MOVE_NEEDED): Transition(S.PLAN, (F.PLAN,)),
     (S.VERIFY, E.MEASURE_MORE): Transition(S.MEASURE, (F.MEASURE,)),
     (S.VERIFY, E.ACCEPTED): Transition(S.DOCKED),
