@@ -66,9 +66,7 @@ class NodeBringUp:
             await self._write(self._map.objects[name], number)
         await self._map_pdos()
         await self._set_mode()
-        if self.sdo.stray:
-            cause = f"{self.sdo.stray} answers too many: two devices use node number {self.node.node}"
-            raise WrongIdentity(self.node.name, cause, value="two devices", limit="one device")
+        self._refuse_twin()
         return identity
 
     async def standing(self) -> tuple[int, int]:
@@ -81,6 +79,7 @@ class NodeBringUp:
         profile = await read(objects["device_type"]) & 0xFFFF
         self._expect("device profile", profile, self._map.device_profile)
         found = {name: await read(objects[name]) for name in ("vendor", "product", "revision", "serial")}
+        self._refuse_twin()
         for name, value in self._map.identity.items():
             self._expect(name, found[name], value)
         if self.node.axis.serial_number is not None:
@@ -94,6 +93,11 @@ class NodeBringUp:
         product = f"{name_text} {found['product']:08X}h".strip()
         firmware = f"{version} revision {found['revision']:08X}h".strip()
         return Identity(self.node.name, f"{found['vendor']:08X}h", product, str(found["serial"]), firmware)
+
+    def _refuse_twin(self) -> None:
+        if self.sdo.stray:
+            cause = f"{self.sdo.stray} answers too many: two devices use node number {self.node.node}"
+            raise WrongIdentity(self.node.name, cause, value="two devices", limit="one device")
 
     async def _text(self, name: str) -> str:
         data = await self.sdo.read_bytes(self._map.objects[name])

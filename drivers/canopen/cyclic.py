@@ -11,7 +11,7 @@ from docking.errors import AxisLimitExceeded
 from docking.ports import CanFrame
 from docking.types import Array, AxisState, Feedback, readonly
 from drivers.canopen import cia402, codec
-from drivers.canopen.cia402 import DriveState
+from drivers.canopen.cia402 import DriveState, Goal
 from drivers.canopen.nodes import AxisNode
 from drivers.canopen.watch import NodeWatch
 from drivers.maps.objects import ObjectMap
@@ -166,6 +166,9 @@ class CyclicImage:
         self._joined = None
         if index in self._slots:
             self._target[self._slots[index]] = position_counts
+            # A dead controller may have left the axis under torque: the first controlword must not take it away.
+            state, closed = cia402.decode(statusword), bool(statusword & self._brake)
+            self.command(index, cia402.next_controlword(state, Goal.DISABLED, closed))
             self._dirty = True
 
     def state(self, index: int) -> DriveState:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Coroutine, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -165,14 +166,15 @@ class CanopenPositioners:
         self._image.seed(setup.node.index, statusword, position)
         return identity
 
-    @staticmethod
-    async def _together(jobs: Sequence[object]) -> tuple[Identity, ...]:
+    async def _together(self, jobs: Sequence[Coroutine[Any, Any, Identity]]) -> tuple[Identity, ...]:
         """Run the nodes' jobs side by side; raise the first error in axis order after all have ended."""
-        results = await asyncio.gather(*jobs, return_exceptions=True)  # type: ignore[call-overload]
-        for result in results:
-            if isinstance(result, BaseException):
-                raise result
-        return tuple(results)
+        results = await asyncio.gather(*jobs, return_exceptions=True)
+        errors = [result for result in results if isinstance(result, BaseException)]
+        if self._lost is not None:
+            raise LinkLost(self._bus.channel, self._lost)
+        if errors:
+            raise errors[0]
+        return tuple(result for result in results if isinstance(result, Identity))
 
     async def _all_reporting(self) -> None:
         """Wait until every node's read-back is fresh and its heartbeat alive. Raises DeviceSilent."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 import select
 import socket
 import struct
-import time
 from typing import Any
 
 import can
@@ -72,7 +71,6 @@ class UnixBus(can.BusABC):
 def _message(record: bytes) -> can.Message:
     identifier, length, data = _RECORD.unpack(record)
     return can.Message(
-        timestamp=time.time(),
         arbitration_id=identifier & 0x1FFF_FFFF,
         is_extended_id=bool(identifier & _EXTENDED),
         is_remote_frame=bool(identifier & _REMOTE),

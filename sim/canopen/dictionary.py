@@ -26,6 +26,9 @@ _FACTORY: Final = {
 }
 """Communication object -> COB-ID base and mapping as the drive leaves the factory: not what a controller wants."""
 
+_TRANSMISSION: Final = {0x1400: (0, 240), 0x1800: (1, 1), 0x1801: (10, 10)}
+"""Transmission types that these drives support: synchronous ones only."""
+
 _SPANS: Final = {
     "B": (0, 0xFF),
     "b": (-0x80, 0x7F),
@@ -120,7 +123,9 @@ class Dictionary:
         mapping = communication + 0x200
         count = self.number(mapping, 0)
         words = tuple(self.number(mapping, sub) for sub in range(1, count + 1))
-        return not self.number(communication, 1) & INVALID and words == _LAYOUTS.get(mapping)
+        low, high = _TRANSMISSION[communication]
+        timely = low <= self.number(communication, 2) <= high
+        return timely and not self.number(communication, 1) & INVALID and words == _LAYOUTS.get(mapping)
 
     def _find(self, index: int, sub: int) -> Entry:
         entry = self._entries.get((index, sub))
@@ -136,6 +141,9 @@ class Dictionary:
         if not index & 0x200:
             before = self.number(index, 1)
             if sub == 1 and not before & INVALID and not value & INVALID and before != value:
+                raise Abort(OUT_OF_RANGE)
+            low, high = _TRANSMISSION.get(index, (0, 255))
+            if sub == 2 and not low <= value <= high:
                 raise Abort(OUT_OF_RANGE)
             return
         if not self.number(index - 0x200, 1) & INVALID:
