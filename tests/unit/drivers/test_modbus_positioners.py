@@ -458,7 +458,7 @@ def test_a_plc_that_ignores_segments_ends_the_loading() -> None:
     async def scenario(bench: Bench) -> None:
         await bench.start()
         bench.group.plcs[1]._take_segment = lambda data: None  # type: ignore[method-assign]
-        with pytest.raises(SegmentRejected, match="positioner B.*only 0 segments"):
+        with pytest.raises(SegmentRejected, match=r"positioner B.*only 0 segments"):
             await bench.driver.load(bench.plan)
 
     play(scenario)
