@@ -60,6 +60,7 @@ class DriveGroup:
         count = len(self.nodes)
         self._table = np.zeros(count, _TPDO)
         self._table_encoder: Array | None = None
+        self._error: Array = self._plant.following_error_mm()
         self._cached: list[CanFrame] | None = None
         self._pending: dict[int, bytes] = {}
         self._last_joined = b""
@@ -192,7 +193,8 @@ class DriveGroup:
         set_point = drives.advance(now_s, elapsed_s, plant.encoder_mm)
         plant.step(now_s, set_point, drives.powered, drives.braked)
         if not plant.at_rest():
-            drives.monitor(now_s, plant.following_error_mm())
+            self._error = plant.following_error_mm()
+            drives.monitor(now_s, self._error)
             self._cached = None
 
     def _report(self) -> None:
@@ -213,7 +215,7 @@ class DriveGroup:
             table["position"] = np.rint(encoder * self._counts_per_mm)
             self._table_encoder = encoder
         # The low 16 bits of the 32-bit following error: larger errors wrap, as on a real drive.
-        table["error"] = np.rint(plant.following_error_mm() * self._counts_per_mm).astype(np.int64)
+        table["error"] = np.rint(self._error * self._counts_per_mm).astype(np.int64)
         table["statusword"] = self.drives.statuswords
         self.drives.changed = False
         raw = table.tobytes()
@@ -293,9 +295,9 @@ class DriveGroup:
         set_point = drives.coast(now_s, now_s - self._step_s, plant.encoder_mm)
         plant.step(now_s, set_point, drives.powered, drives.braked)
         self._step_s = now_s
-        self._cached = None
+        self._cached, self._error = None, plant.following_error_mm()
         if not plant.at_rest():
-            drives.monitor(now_s, plant.following_error_mm())
+            drives.monitor(now_s, self._error)
         quiet = plant.at_rest() and not drives.busy
         self._sync_timer = self._loop.call_at(now_s + (_LONG_S if quiet else drives.cycle_s), self._check_sync)
 
