@@ -5,7 +5,7 @@ The component and the mate are fitted from the same station, so the station's ow
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -54,9 +54,10 @@ class FeatureBudget:
 def noise_of(cell: CellFile) -> NoiseModel:
     """The instrument's noise: the cell's own numbers, else those of the device class."""
     own = cell.tracker.noise
-    if own is None:
-        return NOISE_PRESETS[cell.tracker.device_class]
-    return NoiseModel.from_um(own.range_um, own.range_um_per_m, own.transverse_um, own.transverse_um_per_m)
+    model = NOISE_PRESETS[cell.tracker.device_class]
+    if own is not None:
+        model = NoiseModel.from_um(own.range_um, own.range_um_per_m, own.transverse_um, own.transverse_um_per_m)
+    return replace(model, seating_mm=cell.tracker.seating_um * 1e-3)
 
 
 def docked_pose(cell: CellFile, job: JobFile) -> Pose:

@@ -41,6 +41,9 @@ class TrackerConfig(Model):
     station_pose: PoseVector = Field(description="approximate X_WT, mm and deg; refined from the ERS points")
     ers: tuple[ErsPoint, ...] = Field(min_length=4, description="fixed reference points that define W")
     measure_timeout_s: Positive = Field(default=15.0, description="longest time one point may take, s")
+    seating_um: NonNegative = Field(
+        default=10.0, description="repeatability of a reflector in its nest, 1 sigma a coordinate, um"
+    )
     two_face: bool = Field(default=False, description="the instrument measures in both faces")
     two_face_limit_mm: Positive = Field(
         default=0.5, description="largest distance between the two faces' readings of a point, mm"

@@ -4,7 +4,8 @@ A reading at distance d has the standard deviations
     range       sqrt( (range + range_per_mm d)^2 + offset^2 )
     transverse  transverse + transverse_per_mm d
 and the covariance `u u^T s_r^2 + (I - u u^T) s_t^2`, u = unit line of sight, which equals numerics C's
-`R_dir diag(sr^2, st^2, st^2) R_dir^T`.
+`R_dir diag(sr^2, st^2, st^2) R_dir^T`. A reflector never sits twice at the same place: its repeatability in the nest adds
+`seating^2 I`.
 """
 
 from __future__ import annotations
@@ -27,14 +28,16 @@ class NoiseModel:
     transverse_mm: float
     transverse_per_mm: float
     range_offset_mm: float = 0.0
+    seating_mm: float = 0.0
 
     def __post_init__(self) -> None:
         if not (self.range_mm > 0.0 and self.transverse_mm > 0.0):
             raise BadArgument(
                 "noise", "the constant parts must be positive", value=min(self.range_mm, self.transverse_mm)
             )
-        if not (self.range_per_mm >= 0.0 and self.transverse_per_mm >= 0.0 and self.range_offset_mm >= 0.0):
-            raise BadArgument("noise", "slopes and offset must not be negative")
+        others = (self.range_per_mm, self.transverse_per_mm, self.range_offset_mm, self.seating_mm)
+        if not all(value >= 0.0 for value in others):
+            raise BadArgument("noise", "slopes, offset and seating must not be negative")
 
     @classmethod
     def from_um(
@@ -61,7 +64,8 @@ class NoiseModel:
         along, across = self.sigmas_mm(d)
         u = p / d[:, None]
         sight = u[:, :, None] * u[:, None, :]
-        result: Array = across[:, None, None] ** 2 * np.eye(3) + (along**2 - across**2)[:, None, None] * sight
+        isotropic = across**2 + self.seating_mm**2
+        result: Array = isotropic[:, None, None] * np.eye(3) + (along**2 - across**2)[:, None, None] * sight
         return result
 
 
