@@ -7,7 +7,7 @@ e + 2 sigma inside its tolerance, ISO 14253-1).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -54,19 +54,20 @@ class Approach:
         goal = goal_pose(X_WC, X_WM, self.features, -station.standoff_mm * self._axis_W(X_WM))
         return correction_to(X_WC.X_MN, goal, self.face_C_mm)
 
-    def close_enough_mm(self, station: Station, sigma_mm: float) -> float:
-        """At a station before contact: the deviation with which the approach may go on, 2 % of the gap, 0.5 mm at most,
-        never less than the dead-band or what the measurement can tell."""
-        tolerance = float(np.min(self.features.tolerance_mm))
-        dead_band = min(self.convergence.dead_band_mm, self.convergence.dead_band_fraction * tolerance)
-        return max(dead_band, sigma_mm, min(0.5, 0.02 * station.standoff_mm))
+    def look(self, errors: FeatureErrors, station: Station, corrections: int, passes: int) -> Attempt:
+        """What the features say at `station`. In contact the acceptance rule judges; before, it is enough that the
+        worst feature is near its place: within 2 % of the gap, 0.5 mm at most, never asking for less than the
+        dead-band or than what the measurement can tell."""
+        seen = attempt(errors, corrections, passes)
+        if station is self.stations[-1]:
+            return seen
+        dead_band = min(self.convergence.dead_band_mm, self.convergence.dead_band_fraction * seen.tolerance_mm)
+        near_mm = max(dead_band, seen.sigma_mm, min(0.5, 0.02 * station.standoff_mm))
+        return replace(seen, tolerance_mm=near_mm, accepted=bool(seen.error_mm <= near_mm))
 
     def verdict(self, history: list[Attempt], station: Station) -> Verdict:
-        """What to do at the last station: accept, move, measure more, or give up."""
+        """What to do after the last look: go on, move, measure more, or give up."""
         return decide(history, self.convergence, station.name)
-
-    def look(self, errors: FeatureErrors, corrections: int, passes: int) -> Attempt:
-        return attempt(errors, corrections, passes)
 
     def _axis_W(self, X_WM: Fit) -> Array:
         axis: Array = X_WM.X_MN.R @ (self.axis_M / np.linalg.norm(self.axis_M))

@@ -22,7 +22,6 @@ from docking.errors import (
     FrameImplausible,
     NotCongruent,
     PermissiveMissing,
-    PlanError,
     PlanStale,
 )
 from docking.kinematics import Positioners, ball_reactions_n, figure_residual_mm, pose_from_axes, sink_mm
@@ -33,6 +32,9 @@ from docking.pose import check_points_agree, fit_pose, screen
 from docking.state import Effect, Event
 from docking.survey import Survey
 from docking.types import Alarm, Array, FeatureErrors, Fit, Plan, Pose
+
+START_TOLERANCE_MM = 0.05
+"""How far an axis may stand from where its plan begins."""
 
 FEWEST_CHECK_POINTS = 2
 """Check points that must remain and agree when one is set aside."""
@@ -189,7 +191,7 @@ class Procedure:
         errors = self._approach.errors(fit, mate, station, self._drift_sigma_mm())
         p.errors = errors
         when = "before" if p.moves == 0 else "after"
-        p.history.append(self._approach.look(errors, p.corrections, p.passes))
+        p.history.append(self._approach.look(errors, station, p.corrections, p.passes))
         self.journal.write("features", records.features_record(errors, station.name, when))
         i = errors.worst()
         self.operator.notify(
@@ -198,39 +200,28 @@ class Procedure:
         )
         if not self._check_points_agree(fit):
             return Event.MEASURE_MORE
-        if station is self._approach.stations[-1]:
-            return self._judge_contact(station)
-        if float(errors.norm_mm[i]) <= self._approach.close_enough_mm(station, float(errors.sigma_mm[i])):
-            p.stage, p.corrections, p.kind, p.history = p.stage + 1, 0, "approach", []
-            return Event.MOVE_NEEDED
-        return self._correct(station)
+        return self._decide(station)
 
-    def _judge_contact(self, station: Station) -> Event:
-        verdict = self._approach.verdict(self.progress.history, station)
-        if verdict.action is Action.DONE:
-            errors = self.progress.errors
-            if errors is not None:
-                self.journal.write("features", records.features_record(errors, station.name, "final"))
-            return Event.ACCEPTED
+    def _decide(self, station: Station) -> Event:
+        p, verdict = self.progress, self._approach.verdict(self.progress.history, station)
         if verdict.action is Action.MEASURE_MORE:
             return Event.MEASURE_MORE
         if verdict.action is Action.MOVE:
-            return self._correct(station)
-        if verdict.action is Action.OUT_OF_TOLERANCE and verdict.error is not None:
+            correction = self._approach.correction(self._component_fit(), self._mate_fit(), station)
+            gap_mm = None if p.moves == 0 else station.standoff_mm
+            check_correction(correction, self._settings.guard, station.name, gap_mm)
+            p.corrections, p.kind = p.corrections + 1, "align"
+            return Event.MOVE_NEEDED
+        if verdict.error is not None:
+            if verdict.action is Action.ABORT:
+                raise verdict.error
             self.alarm(verdict.error)
             return Event.NOT_ACCEPTED
-        raise verdict.error or PlanError(station.name, verdict.reason)
-
-    def _correct(self, station: Station) -> Event:
-        """Ask for a correction at this station, inside the guard."""
-        p = self.progress
-        correction = self._approach.correction(self._component_fit(), self._mate_fit(), station)
-        check_correction(correction, self._settings.guard, station.name, None if p.moves == 0 else station.standoff_mm)
-        if p.corrections >= self._approach.convergence.max_corrections:
-            verdict = self._approach.verdict(p.history, station)
-            raise verdict.error or PlanError(station.name, verdict.reason)
-        p.corrections, p.kind = p.corrections + 1, "align"
-        return Event.MOVE_NEEDED
+        if station is not self._approach.stations[-1]:
+            p.stage, p.corrections, p.kind, p.history = p.stage + 1, 0, "approach", []
+            return Event.MOVE_NEEDED
+        self.journal.write("features", records.features_record(_known(p.errors, "errors"), station.name, "final"))
+        return Event.ACCEPTED
 
     def _check_points_agree(self, fit: Fit) -> bool:
         """Points kept out of the fit must lie where the fit says; they see what the fit's own residuals cannot.
@@ -269,7 +260,7 @@ class Procedure:
             plan_id=p.moves + 1,
             stage=station.name,
             kind=p.kind,
-            q_now_mm=self._commanded(),
+            q_now_mm=self._where_axes_are(),
             correction=correction,
             speed_mm_s=station.speed_mm_s,
             period_s=self._settings.period_s,
@@ -294,6 +285,7 @@ class Procedure:
         age = self._survey.clock() - p.fitted_at_s
         if not (age <= self._settings.fit_age_s):
             raise PlanStale(plan.stage, f"its fit is {age:.0f} s old, at most {self._settings.fit_age_s:.0f} s")
+        self._check_start(plan)
         self.journal.write("intent", records.intent_record(plan), durable=True)
         await self.motion.load(plan)
         self.operator.notify(
@@ -309,6 +301,13 @@ class Procedure:
             raise result.cause
         return Event.MOVED if result.result == "done" else Event.STOPPED
 
+    def _check_start(self, plan: Plan) -> None:
+        """Nothing may have moved an axis between planning and confirmation."""
+        gaps = np.abs(self.motion.feedback().position_mm - plan.q_mm[0])
+        worst = int(np.argmax(gaps))
+        if not (gaps[worst] <= START_TOLERANCE_MM):
+            raise PlanStale(plan.stage, f"{plan.axes[worst]} stands {gaps[worst]:.3f} mm from the start of the plan")
+
     async def _settle(self) -> Event:
         rest_s = await settle(self.motion, self._settings.settle)
         self.journal.write("settled", {"t_s": rest_s})
@@ -320,6 +319,11 @@ class Procedure:
 
     def _commanded(self) -> Array:
         return _known(self.progress.commanded_mm, "commanded axis positions")
+
+    def _where_axes_are(self) -> Array:
+        """Commanded positions of the driven axes (m,); a passive axis follows the component and is read back."""
+        driven = self._settings.positioners.driven
+        return np.where(driven, self._commanded(), self.motion.feedback().position_mm)
 
     def _planned(self) -> Plan:
         return _known(self.progress.plan, "plan")

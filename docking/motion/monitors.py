@@ -42,7 +42,7 @@ class Watch:
     def __init__(self, positioners: Positioners, up: Array, limits: WatchLimits) -> None:
         self._positioners, self._up, self._limits = positioners, up, limits
         self._axes = positioners.axes
-        self._driven = np.asarray(positioners.driven, dtype=bool)
+        self.driven = np.asarray(positioners.driven, dtype=bool)
         v_max = np.asarray(positioners.v_mm_s, dtype=np.float64)
         self._following_slope = (limits.following_vmax_mm - limits.following_rest_mm) / v_max
         self._rated_n = limits.overload_factor * np.asarray(positioners.rated_n, dtype=np.float64).reshape(-1)
@@ -81,7 +81,7 @@ class Watch:
         magnitude = np.abs(error_mm)
         np.maximum(self.max_following_mm, magnitude, out=self.max_following_mm)
         limit = self._limits.following_rest_mm + self._following_slope * np.abs(speed_mm_s)
-        inside = (magnitude <= limit) | ~self._driven
+        inside = (magnitude <= limit) | ~self.driven
         if inside.all():
             return None
         k = int(np.argmin(inside))

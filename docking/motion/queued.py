@@ -47,7 +47,7 @@ class QueuedMotion:
     async def load(self, plan: Plan) -> None:
         if self._cause is not None:
             raise PlanStale(plan.stage, f"the motion side holds a fault: {self._cause}")
-        gap = float(np.max(np.abs(plan.q_mm[0] - self._commanded)))
+        gap = float(np.max(np.abs(plan.q_mm[0] - self._commanded)[self._watch.driven]))
         if not (gap <= START_TOLERANCE_MM):
             raise PlanStale(plan.stage, f"it starts {gap:.4f} mm from where the axes are commanded")
         self._watch.watch_about(plan.q_mm[0])
