@@ -50,7 +50,7 @@ class PlcGroup:
         self._powered = np.zeros(len(self._driven), dtype=np.bool_)
         self._braked = self._driven.copy()
         self._targets: list[Point] = []
-        self._states: list[State] = []
+        self._states: list[tuple[State, bool]] = []
         self._before_s = self._due_s = loop.time()
         self._timer: asyncio.TimerHandle | None = None
         self._servers: list[asyncio.AbstractServer] = []
@@ -134,7 +134,7 @@ class PlcGroup:
         if targets != self._targets:
             self._targets = targets
             self._target_mm = np.array([mm for target in targets for mm in target])
-        states = [plc.state for plc in self.plcs]
+        states = [(plc.state, plc.braked) for plc in self.plcs]
         if states != self._states:
             self._states = states
             self._powered = np.repeat([plc.powered for plc in self.plcs], AXES) & self._driven

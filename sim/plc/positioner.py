@@ -20,6 +20,8 @@ from sim.plc.sensors import Sensors
 SCAN_S = 0.01
 CAPACITY = 256
 POWER_ON_S, BRAKE_S, RUN_LINE_WAIT_S = 0.05, 0.15, 1.0
+STANDSTILL_S = 0.1
+"""Time between the end of a ramp and the closing of the brakes: the axes lag behind their set-points."""
 RELEASING = frozenset((State.ARMED, State.RUNNING, State.DONE))
 POWERED = frozenset(State) - {State.DISABLED, State.FAULT}
 UNBRAKED = POWERED - {State.ENABLING, State.DISABLING}
@@ -50,6 +52,7 @@ class PositionerPlc:
         self.queue = Playback(CAPACITY)
         self.settings = Settings()
         self.state, self.fault = State.DISABLED, Fault.NONE
+        self.braked = True
         self.target_mm: Point = sensors.point_mm()
         self._after_stop = State.HELD
         self._clear_after_stop = False
@@ -163,10 +166,6 @@ class PositionerPlc:
         return self.state in POWERED
 
     @property
-    def braked(self) -> bool:
-        return self.state not in UNBRAKED
-
-    @property
     def _watchdog_armed(self) -> bool:
         return self.settings.watchdog_ms > 0 and self._heartbeat_seen
 
@@ -190,7 +189,8 @@ class PositionerPlc:
             if now_s - self._since_s >= POWER_ON_S + BRAKE_S:
                 self._enter(State.ENABLED, now_s)
         elif state is State.DISABLING:
-            if now_s - self._since_s >= BRAKE_S:
+            self.braked = self.braked or now_s - self._since_s >= STANDSTILL_S
+            if now_s - self._since_s >= STANDSTILL_S + BRAKE_S:
                 self._enter(State.FAULT if self.fault else State.DISABLED, now_s)
         else:
             self._supervise(now_s)
@@ -248,6 +248,8 @@ class PositionerPlc:
 
     def _enter(self, state: State, now_s: float) -> None:
         self.state, self._since_s = state, now_s
+        if state is not State.DISABLING:
+            self.braked = state not in UNBRAKED
 
     def _trip(self, fault: Fault, now_s: float) -> None:
         self.fault = fault

@@ -61,7 +61,7 @@ class StiffPlant:
         self.history: list[tuple[float, Array]] = []
 
     def step(self, t_s: float, target_mm: Array, powered: Any, braked: Any) -> None:
-        against = braked & powered & ~self.jammed & (np.abs(target_mm - self.position_mm) > 0.1)
+        against = braked & powered & ~self.jammed & (np.abs(target_mm - self.position_mm) > 1e-4)
         assert not against.any(), "moved against the brakes"
         self.powered, self.braked = powered.copy(), braked.copy()
         free = powered & ~braked & ~self.jammed
