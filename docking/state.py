@@ -1,11 +1,12 @@
 """What may happen when: states, events, one table, and a pure `step`.
 
-The table is the documentation: `diagram()` renders it (docs/state-diagram.md is generated from it). An event that the
-table does not list for a state is refused with the reason and the list of what is possible.
+The table is the documentation: `python -m docking.state > docs/state-diagram.md` renders it. An event that the table
+does not list for a state is refused with the reason and the list of what is possible.
 """
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -202,3 +203,22 @@ def diagram() -> str:
     folded = ", ".join(s.name for s in S if s in AT_REST)
     lines.append(f"    note right of {S.RECOVER.name}: abort leads here from {folded}")
     return "\n".join(lines) + "\n"
+
+
+def page() -> str:
+    """`docs/state-diagram.md`: the diagram, what revokes the pose, and where a run ends."""
+    revoking = ", ".join(f"`{s.name}`" for s in S if s in POSE_UNKNOWN_IN)
+    final = ", ".join(f"`{s.name}`" for s in S if s in FINAL)
+    return (
+        "# States of the docking cell\n\n"
+        "Generated from `TABLE` in `docking/state.py` by `python -m docking.state > docs/state-diagram.md`.\n"
+        "An event that is not drawn at a state is refused there, with the list of what is possible.\n\n"
+        f"```mermaid\n{diagram()}```\n\n"
+        f"The pose of the component is unknown from entering any of {revoking} until the next `fitted`.\n"
+        f"A run ends in {final}; going on from there is a decision of a person.\n"
+        "The first cause of a fault is kept until `reset`.\n"
+    )
+
+
+if __name__ == "__main__":
+    sys.stdout.write(page())

@@ -1,0 +1,217 @@
+"""The state table against the rules of the cell, told again here as plain text and searched as a graph."""
+
+from __future__ import annotations
+
+import itertools
+from collections import deque
+from pathlib import Path
+
+import pytest
+
+from docking.errors import EventRefused
+from docking.state import FINAL, TABLE, Effect, Event, Situation, State, diagram, page, step
+
+ROOT = Path(__file__).parents[3]
+
+EXPECTED = """
+OFFLINE           LOAD                 STANDBY
+STANDBY           CONNECT              STANDBY           CONNECT
+STANDBY           CONNECTED            DISABLED
+DISABLED          ENABLE               DISABLED          ENABLE
+DISABLED          ENABLED              IDLE
+IDLE              START_SEATED         MEASURE_FRAME     LOCATE
+IDLE              START_EMPTY          HOMING            HOME
+HOMING            HOMED                HOMED
+HOMED             MEASURE_FRAME        MEASURE_FRAME     LOCATE
+MEASURE_FRAME     FRAME_MEASURED       MEASURE           MEASURE
+MEASURE_FRAME     FRAME_MEASURED_EMPTY BALL_ENTRY        ENTER_BALLS
+MEASURE_FRAME     ABORT                RECOVER
+BALL_ENTRY        BALLS_ENTERED        LOCK_BALLS        LOCK_BALLS
+LOCK_BALLS        BALLS_LOCKED         LIFT              TAKE_LOAD
+LIFT              LOAD_TAKEN           LEVEL             LEVEL
+LEVEL             LEVELLED             MEASURE           MEASURE
+MEASURE           MEASURED             FIT               FIT
+MEASURE           ABORT                RECOVER
+FIT               FITTED               VERIFY            JUDGE
+FIT               MEASURE_MORE         MEASURE           MEASURE
+FIT               ABORT                RECOVER
+VERIFY            MOVE_NEEDED          PLAN              PLAN
+VERIFY            MEASURE_MORE         MEASURE           MEASURE
+VERIFY            ACCEPTED             DOCKED
+VERIFY            NOT_ACCEPTED         OUT_OF_TOLERANCE
+VERIFY            ABORT                RECOVER
+PLAN              PLANNED              CONFIRM           ASK
+PLAN              ABORT                RECOVER
+CONFIRM           CONFIRMED            MOVE              MOVE
+CONFIRM           DECLINED             RECOVER
+CONFIRM           ABORT                RECOVER
+MOVE              HOLD                 PAUSED            HOLD
+MOVE              MOVED                SETTLE            SETTLE
+MOVE              ABORT                STOPPING          STOP
+PAUSED            RESUME               MOVE              RESUME
+PAUSED            MOVED                SETTLE            SETTLE
+PAUSED            ABORT                STOPPING          STOP
+STOPPING          STOPPED              RECOVER
+STOPPING          MOVED                RECOVER
+SETTLE            SETTLED              MEASURE           MEASURE
+SETTLE            ABORT                RECOVER
+FAULT             RESET                RECOVER
+RECOVER           ENABLE               DISABLED          ENABLE
+DOCKED            CLOSE                STANDBY
+OUT_OF_TOLERANCE  CLOSE                STANDBY
+"""
+"""state, event, next state, what is done on entering it; `FAULTED` leads to FAULT from every state but FAULT."""
+
+ALL = list(itertools.product(State, Event))
+
+
+def expected() -> dict[tuple[State, Event], tuple[State, tuple[Effect, ...]]]:
+    rows = {}
+    for line in EXPECTED.strip().splitlines():
+        state, event, target, *effects = line.split()
+        rows[State[state], Event[event]] = State[target], tuple(Effect[e] for e in effects)
+    rows |= {(s, Event.FAULTED): (State.FAULT, ()) for s in State if s is not State.FAULT}
+    return rows
+
+
+def after(*events: Event, start: Situation | None = None) -> Situation:
+    situation = start or Situation()
+    for event in events:
+        situation, _ = step(situation, event)
+    return situation
+
+
+E = Event
+TO_FIT = (E.LOAD, E.CONNECTED, E.ENABLED, E.START_SEATED, E.FRAME_MEASURED, E.MEASURED)
+TO_MOVE = (*TO_FIT, E.FITTED, E.MOVE_NEEDED, E.PLANNED, E.CONFIRMED)
+
+
+@pytest.mark.parametrize(("state", "event"), ALL, ids=lambda v: v.value)
+def test_every_pair_leads_where_the_rules_say_or_is_refused(state, event):
+    want = expected().get((state, event))
+    before = Situation(state, position_known=False)
+    if want is None:
+        with pytest.raises(EventRefused) as refused:
+            step(before, event)
+        said = refused.value.text()
+        assert state.value in said
+        assert event.value in said
+        for possible in (e.value for s, e in expected() if s is state):
+            assert possible in said
+        return
+    situation, effects = step(before, event)
+    assert (situation.state, effects) == want
+
+
+def test_every_state_can_be_reached_and_left():
+    rows = expected()
+    reached = {State.OFFLINE} | {target for target, _ in rows.values()}
+    assert reached == set(State)
+    assert all(any(s is state for s, _ in rows) for state in State), "a state without a way out"
+
+
+def reachable(start: Situation, *, without: set[Event] = frozenset()) -> set[Situation]:
+    """All situations that any events but `without` can lead to."""
+    seen, todo = {start}, deque([start])
+    while todo:
+        situation = todo.popleft()
+        for event in set(Event) - without:
+            try:
+                following, _ = step(situation, event, "cause" if event is Event.FAULTED else None)
+            except EventRefused:
+                continue
+            if following not in seen:
+                seen.add(following)
+                todo.append(following)
+    return seen
+
+
+@pytest.mark.parametrize("missing", [E.MEASURED, E.FITTED, E.PLANNED, E.CONFIRMED])
+@pytest.mark.parametrize("origin", [State.FAULT, State.RECOVER, State.OFFLINE])
+def test_nothing_moves_without_measuring_fitting_planning_and_a_confirmation(origin, missing):
+    states = {s.state for s in reachable(Situation(origin), without={missing})}
+    assert State.MOVE not in states
+    assert State.MOVE in {s.state for s in reachable(Situation(origin))}
+
+
+@pytest.mark.parametrize("missing", [E.MEASURED, E.FITTED, E.PLANNED, E.CONFIRMED])
+def test_a_second_move_needs_all_four_again(missing):
+    settled = after(*TO_MOVE, E.MOVED)
+    assert State.MOVE not in {s.state for s in reachable(settled, without={missing})}
+
+
+def test_a_paused_move_is_resumed_without_a_plan_but_a_stopped_one_is_not():
+    paused = after(*TO_MOVE, E.HOLD)
+    assert after(E.RESUME, start=paused).state is State.MOVE
+    stopping = after(E.ABORT, start=paused)
+    assert State.MOVE not in {s.state for s in reachable(stopping, without={E.CONFIRMED})}
+
+
+def test_wherever_a_move_is_planned_or_confirmed_the_pose_is_known():
+    for situation in reachable(Situation()):
+        if situation.state in (State.VERIFY, State.PLAN, State.CONFIRM, State.DOCKED, State.OUT_OF_TOLERANCE):
+            assert situation.position_known, situation
+        if situation.state in (State.MOVE, State.PAUSED, State.STOPPING, State.SETTLE, State.FAULT, State.RECOVER):
+            assert not situation.position_known, situation
+
+
+def test_only_a_fit_makes_the_pose_known():
+    for situation in reachable(Situation(), without={E.FITTED}):
+        assert not situation.position_known, situation
+    for (state, event), _ in expected().items():
+        situation, _ = step(Situation(state, position_known=False), event)
+        assert situation.position_known == (event is E.FITTED), (state, event)
+
+
+@pytest.mark.parametrize("ending", [(E.FAULTED,), (E.ABORT,)])
+def test_a_fault_or_a_stop_at_rest_revokes_the_pose(ending):
+    verifying = after(*TO_FIT, E.FITTED)
+    assert verifying.position_known
+    assert not after(*ending, start=verifying).position_known
+
+
+def test_a_move_revokes_the_pose_until_the_next_fit():
+    moving = after(*TO_MOVE)
+    assert not moving.position_known
+    measured = after(E.MOVED, E.SETTLED, E.MEASURED, start=moving)
+    assert not measured.position_known
+    assert after(E.FITTED, start=measured).position_known
+
+
+def test_the_first_cause_is_kept_until_the_reset():
+    faulted, _ = step(after(*TO_MOVE), E.FAULTED, "axis B.Y lags")
+    assert faulted.cause == "axis B.Y lags"
+    with pytest.raises(EventRefused):
+        step(faulted, E.FAULTED, "and the tracker is silent")
+    recovering = after(E.RESET, start=faulted)
+    assert recovering.cause is None
+    again, _ = step(recovering, E.FAULTED, "node 4 is silent")
+    assert again.cause == "node 4 is silent"
+
+
+def test_a_run_ends_only_where_a_person_decides():
+    assert set(FINAL) == {State.DOCKED, State.OUT_OF_TOLERANCE, State.RECOVER, State.FAULT}
+    leaving = {event for (state, event) in expected() if state in FINAL}
+    assert leaving == {E.CLOSE, E.RESET, E.ENABLE, E.FAULTED}
+
+
+def test_step_changes_nothing_but_its_result():
+    before = Situation(State.FIT, position_known=False, cause=None)
+    step(before, E.FITTED)
+    assert before == Situation(State.FIT, position_known=False, cause=None)
+
+
+def test_the_diagram_draws_every_row_once():
+    drawn = diagram()
+    for (state, event), (target, _) in expected().items():
+        arrow = f"    {state.name} --> {target.name}: {event.value}\n"
+        folded = event is E.FAULTED or (event is E.ABORT and target is State.RECOVER)
+        assert drawn.count(arrow) == (0 if folded else 1), arrow
+    abort_note = next(line for line in drawn.splitlines() if "abort leads here" in line)
+    for state, event in expected():
+        if event is E.ABORT and TABLE[state, event].target is State.RECOVER:
+            assert state.name in abort_note
+
+
+def test_the_page_in_the_docs_is_the_table():
+    assert (ROOT / "docs" / "state-diagram.md").read_text("utf-8") == page()
