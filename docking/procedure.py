@@ -234,7 +234,7 @@ class Procedure:
         if not len(seen):
             return True
         try:
-            off = check_points_agree(fit, nominal, seen)
+            off_mm, limit_mm = check_points_agree(fit, nominal, seen)
         except CheckPointDisagrees as error:
             gross = isinstance(error.value, float) and error.value > self._settings.target_residual_mm
             if gross and len(seen) > FEWEST_CHECK_POINTS:
@@ -243,8 +243,8 @@ class Procedure:
             if self.progress.passes < self._approach.convergence.max_passes:
                 return False
             raise
-        errors = np.linalg.norm(off, axis=1).tolist()
-        self.journal.write("check_points", {"names": list(seen.names), "error_mm": errors, "limit_mm": None})
+        body = {"error_mm": np.linalg.norm(off_mm, axis=1).tolist(), "limit_mm": limit_mm.tolist()}
+        self.journal.write("check_points", {"names": list(seen.names), **body})
         return True
 
     def _set_aside(self, error: CheckPointDisagrees) -> None:

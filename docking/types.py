@@ -218,6 +218,7 @@ class Plan(_Frozen):
 
     `t_s` (n,) path time on an even grid of `period_s`; `q_mm` (n, m) axis positions in the order of `axes`
     (driven and passive); `s` (n,) the scalar path coordinate 0..1. `plan_hash` identifies the content.
+    `margins`: for each axis the least room to the stroke's margin (mm) and to its speed limit (mm/s).
     `duration_s` is t_s[-1]. All stops and holds change the rate at which path time runs, never the path.
     """
 

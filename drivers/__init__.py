@@ -1,1 +1,1 @@
-"""Bytes <-> ports: one seam per wire in `links`, pure codecs, sequences with deadlines, register and object maps as data."""
+"""Bytes <-> ports: one seam per wire in `links`, pure codecs, sequences with deadlines, maps as data in `maps`."""

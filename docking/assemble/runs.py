@@ -206,6 +206,11 @@ def _started(run: _Run) -> dict[str, Any]:
             "following_error_mm": limits.following_error_vmax_mm,
             "ball_residual_mm": limits.ball_residual_mm,
             "internal_force_n": limits.internal_force_n,
+            "axis_force_n": {
+                f"{p.name}.{a.name}": rated
+                for p in files.cell.positioners
+                for a, rated in zip(p.axes, p.rated_n, strict=True)
+            },
         },
     }
 

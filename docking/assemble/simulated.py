@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from docking.assemble.controller import Wires
 from docking.config import CellFile, JobFile
 from docking.config.cell import CanBus, ModbusBus
@@ -54,13 +56,18 @@ class FarEnd:
 
     def drives(self, cell: CellFile, wire: CanEnd) -> None:
         """Put the drives on a CAN bus."""
-        group = DriveGroup(self.plant, cell, DriveSettings(sync_loss=self.truth.drives.sync_loss), wire, self.loop)
+        drives = self.truth.drives
+        settings = DriveSettings(sync_loss=drives.sync_loss, sync_loss_cycles=drives.sync_loss_cycles)
+        group = DriveGroup(self.plant, cell, settings, wire, self.loop)
         group.start()
         self.devices.append(group)
 
     async def plcs(self, cell: CellFile, addresses: dict[str, tuple[str, int]] | None) -> dict[str, tuple[str, int]]:
         """Let the positioner PLCs listen; return their addresses."""
-        group = PlcGroup(self.plant, cell, [self.plant.clock_ppm[p.name] for p in cell.positioners], self.loop)
+        names = [p.name for p in cell.positioners]
+        skew_s = cell.bus.start_skew_s if isinstance(cell.bus, ModbusBus) else 0.0
+        late_s = np.random.default_rng([self.seed, len(names)]).uniform(0.0, skew_s, len(names)).tolist()
+        group = PlcGroup(self.plant, cell, [self.plant.clock_ppm[n] for n in names], self.loop, late_s)
         self.devices.append(group)
         return await group.serve(addresses)
 

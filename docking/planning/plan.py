@@ -46,7 +46,9 @@ def make_plan(request: PlanRequest, positioners: Positioners, settings: PlanSett
     q = path.axes_mm(s)
     peak = check_table(s, q, request.period_s, positioners)
     chord = check_chord(path, s, settings.chord_error_mm) if request.linear_interpolation else 0.0
-    margins = tuple((axis, float(room[k]), float(peak[k])) for k, axis in enumerate(positioners.axes))
+    margins = tuple(
+        (axis, float(room[k]), float(positioners.v_mm_s[k] - peak[k])) for k, axis in enumerate(positioners.axes)
+    )
     return Plan(
         plan_id=request.plan_id,
         plan_hash=_content_hash(request, positioners.axes, s, q),

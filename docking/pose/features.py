@@ -7,6 +7,7 @@ covariance of the features on both sides, and temperature; the largest eigenvalu
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
@@ -103,8 +104,15 @@ def goal_pose(component: Fit, mate: Fit, features: Features, standoff_W_mm: Arra
     return Pose(X_WC.R, X_WC.t_mm + shift)
 
 
-def check_points_agree(fit: Fit, nominal: Points, measured: Points, false_alarm: float = 0.001) -> Array:
-    """Measured minus predicted (n, 3) of the points kept out of the fit.
+class CheckPoints(NamedTuple):
+    """Measured minus predicted (n, 3) of points kept out of a fit, and how long each difference might be (n,)."""
+
+    off_mm: Array
+    limit_mm: Array
+
+
+def check_points_agree(fit: Fit, nominal: Points, measured: Points, false_alarm: float = 0.001) -> CheckPoints:
+    """Compare the points kept out of the fit with where it puts them.
 
     `nominal` in the body's frame and `measured` in the fit's M, same names in the same order. The test is chi-square
     with 3 degrees of freedom on fit, reading and nominal covariance. Raises CheckPointDisagrees naming the worst,
@@ -118,9 +126,10 @@ def check_points_agree(fit: Fit, nominal: Points, measured: Points, false_alarm:
         raise SigmaMissing("check point", value="a check point")
     statistic = np.einsum("ni,ni->n", off, np.linalg.solve(cov, off[:, :, None])[:, :, 0])
     quantile = float(chi2.isf(false_alarm / max(len(off), 1), 3))
+    size = np.linalg.norm(off, axis=1)
+    limit = size * np.sqrt(quantile / np.maximum(statistic, np.finfo(float).tiny))
     for i in np.argsort(-statistic):
         if not (statistic[i] <= quantile):
-            size = float(np.linalg.norm(off[i]))
-            limit = size * float(np.sqrt(quantile / statistic[i])) if np.isfinite(statistic[i]) else None
-            raise CheckPointDisagrees(measured.names[i], value=size, limit=limit)
-    return off
+            known = float(limit[i]) if np.isfinite(limit[i]) else None
+            raise CheckPointDisagrees(measured.names[i], value=float(size[i]), limit=known)
+    return CheckPoints(off, limit)

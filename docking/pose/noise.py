@@ -4,8 +4,8 @@ A reading at distance d has the standard deviations
     range       sqrt( (range + range_per_mm d)^2 + offset^2 )
     transverse  transverse + transverse_per_mm d
 and the covariance `u u^T s_r^2 + (I - u u^T) s_t^2`, u = unit line of sight, which equals numerics C's
-`R_dir diag(sr^2, st^2, st^2) R_dir^T`. A reflector never sits twice at the same place: its repeatability in the nest adds
-`seating^2 I`.
+`R_dir diag(sr^2, st^2, st^2) R_dir^T`. A reflector never sits twice at the same place: its repeatability in the nest
+adds `seating^2 I`.
 """
 
 from __future__ import annotations

@@ -101,7 +101,7 @@ def test_check_points() -> None:
     sigma = np.broadcast_to(0.01**2 * np.eye(3), (2, 3, 3))
     nominal = Points(("K1", "K2"), np.array([[0.0, 0, 0], [1000.0, 0, 0]]), sigma)
     seen = TURN.apply(nominal.xyz_mm) + np.array([[0.01, 0, 0], [0, -0.02, 0]])
-    off = check_points_agree(fit(TURN), nominal, Points(nominal.names, seen, sigma))
+    off = check_points_agree(fit(TURN), nominal, Points(nominal.names, seen, sigma)).off_mm
     assert np.allclose(off, [[0.01, 0, 0], [0, -0.02, 0]])
     with pytest.raises(CheckPointDisagrees) as caught:
         check_points_agree(fit(TURN), nominal, Points(nominal.names, seen + np.array([[0, 0, 0], [0, 0, 0.2]]), sigma))
