@@ -195,7 +195,8 @@ class Misalignment(Model):
 
 
 class Drives(Model):
-    """Servo drives and brakes as they really are."""
+    """Servo drives and brakes as they really are; drives on CAN react as `sync_loss` says to `sync_loss_cycles` without
+    SYNC."""
 
     servo_lag_s: Positive
     servo_lag_spread: NonNegative
@@ -206,6 +207,7 @@ class Drives(Model):
     back_drive_mm_s2: NonNegative
     passive_friction_n: Positive
     sync_loss: Literal["hold", "ignore", "extrapolate", "quick-stop", "fault"]
+    sync_loss_cycles: Positive = 3.0
 
 
 class InstrumentTruth(Model):

@@ -54,10 +54,12 @@ class FarEnd:
         device = {"line": LineTrackerDevice, "geocom": GeocomStation}[cell.tracker.protocol]
         self.devices.append(device(self.instrument, wire, self.loop, self.seed))
 
-    def drives(self, cell: CellFile, wire: CanEnd) -> None:
+    def drives(self, cell: CellFile, wire: CanEnd, *, shared_cpu: bool = False) -> None:
         """Put the drives on a CAN bus."""
         drives = self.truth.drives
-        settings = DriveSettings(sync_loss=drives.sync_loss, sync_loss_cycles=drives.sync_loss_cycles)
+        settings = DriveSettings(
+            sync_loss=drives.sync_loss, sync_loss_cycles=drives.sync_loss_cycles, shared_cpu=shared_cpu
+        )
         group = DriveGroup(self.plant, cell, settings, wire, self.loop)
         group.start()
         self.devices.append(group)
@@ -112,7 +114,7 @@ async def real_wires(cell: CellFile, far: FarEnd, folder: Path) -> dict[str, Any
         return found
     bus = UnixCanServer(folder / "can.sock")
     await bus.open()
-    far.drives(cell, bus)
+    far.drives(cell, bus, shared_cpu=True)
     far.devices.append(bus)
     found["can"] = str(bus.path)
     return found

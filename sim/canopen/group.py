@@ -24,8 +24,9 @@ from sim.wires.can_frames import CanEnd, CanFrame
 _SYNC = 0x80
 _RPDO: Final = np.dtype([("controlword", "<u2"), ("target", "<i4"), ("mode", "i1")])
 _TPDO: Final = np.dtype([("statusword", "<u2"), ("position", "<i4"), ("error", "<i2")])
-_SYNC_LOST_CYCLES: Final = 3.0
 _LONG_S: Final = 0.05
+_SHORTEST_CYCLES: Final = 0.9
+"""With `shared_cpu` no SYNC counts as less than this much of a cycle after the one before."""
 
 
 class DriveGroup:
@@ -51,6 +52,7 @@ class DriveGroup:
         self.muted: set[int] = set()
         self._sync_s: float | None = None
         self._step_s = 0.0
+        self._waiting = 0
         self._syncs = 0
         self._sync_timer: asyncio.TimerHandle | None = None
         self._coasting = False
@@ -100,6 +102,8 @@ class DriveGroup:
     # frames ------------------------------------------------------------------------------------------------------
     def _on_frames(self, batch: list[CanFrame]) -> None:
         cobs = self._fast_cobs
+        if self._settings.shared_cpu and len(batch) > len(cobs):
+            self._waiting = max(0, [frame[0] for frame in batch].count(_SYNC) - 1)
         head = batch[: len(cobs)]
         if [frame[0] for frame in head] == cobs:
             joined = b"".join([frame[1] for frame in head])
@@ -171,7 +175,7 @@ class DriveGroup:
     # SYNC --------------------------------------------------------------------------------------------------------
     def _sync(self, joined: bytes | None) -> None:
         """One SYNC: bring the plant to now, report what is, then take the new set-points."""
-        now_s = self._loop.time()
+        now_s = self._sync_time_s()
         self._advance(now_s)
         self._report()
         if self.drives.busy:
@@ -186,6 +190,16 @@ class DriveGroup:
         if self._sync_timer is None or self._coasting:
             self._coasting = False
             self._arm_sync_monitor(now_s)
+
+    def _sync_time_s(self) -> float:
+        """When this SYNC came. Of several that waited until this process got the CPU, each came a cycle before the next."""
+        now_s = self._loop.time()
+        if not self._settings.shared_cpu or self._sync_s is None:
+            return now_s
+        cycle_s = self.drives.cycle_s
+        came_s = now_s - self._waiting * cycle_s
+        self._waiting = max(0, self._waiting - 1)
+        return max(came_s, self._step_s + _SHORTEST_CYCLES * cycle_s)
 
     def _advance(self, now_s: float) -> None:
         plant, drives = self._plant, self.drives
@@ -261,14 +275,14 @@ class DriveGroup:
     def _arm_sync_monitor(self, base_s: float) -> None:
         if self._sync_timer is not None:
             self._sync_timer.cancel()
-        due_s = base_s + _SYNC_LOST_CYCLES * self.drives.cycle_s
+        due_s = base_s + self._settings.sync_loss_cycles * self.drives.cycle_s
         self._sync_timer = self._loop.call_at(due_s, self._check_sync)
 
     def _check_sync(self) -> None:
         """Runs a few cycles after some SYNC: either newer ones came meanwhile, or the drives are on their own."""
         self._sync_timer = None
         now_s, last_s = self._loop.time(), self._sync_s or 0.0
-        if now_s - last_s < (_SYNC_LOST_CYCLES - 0.5) * self.drives.cycle_s:
+        if now_s - last_s < (self._settings.sync_loss_cycles - 0.5) * self.drives.cycle_s:
             self._arm_sync_monitor(last_s)
             return
         if not self._coasting:
@@ -292,6 +306,7 @@ class DriveGroup:
     def _coast(self, now_s: float) -> None:
         """One step of the drives on their own; again every cycle while something moves, seldom otherwise."""
         plant, drives = self._plant, self.drives
+        now_s = max(now_s, self._step_s)
         set_point = drives.coast(now_s, now_s - self._step_s, plant.encoder_mm)
         plant.step(now_s, set_point, drives.powered, drives.braked)
         self._step_s = now_s

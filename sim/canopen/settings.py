@@ -10,15 +10,18 @@ SyncLoss = Literal["hold", "ignore", "extrapolate", "quick-stop", "fault"]
 
 @dataclass(frozen=True)
 class DriveSettings:
-    """Brake times and the reaction to a missing SYNC (noticed after three cycles).
+    """Brake times and the reaction to a SYNC missing for `sync_loss_cycles`.
 
     `hold` and `ignore`: stand at the last target; `extrapolate`: go on at the last speed until something else stops
-    the drive; `quick-stop` and `fault`: ramp down, with emergency 8700h.
+    the drive; `quick-stop` and `fault`: ramp down, with emergency 8700h. `shared_cpu`: the process that simulates the
+    drives may be kept from the CPU, which real drives are not: SYNCs count as evenly spaced then.
     """
 
     brake_open_s: float = 0.08
     brake_close_s: float = 0.06
     sync_loss: SyncLoss = "hold"
+    sync_loss_cycles: float = 3.0
+    shared_cpu: bool = False
     vendor: int = 0x0000_05D0
     product: int = 0x0402_0008
     revision: int = 0x0001_0003
