@@ -23,13 +23,14 @@ class Cell:
         self.situation = Situation()
         self._events: asyncio.Queue[tuple[Event, DockingError | None]] = asyncio.Queue()
         self._activity: asyncio.Task[None] | None = None
+        self._defect: BaseException | None = None
 
     def post(self, event: Event) -> None:
         """An event from the operator; one that the table refuses is told and changes nothing."""
         self._events.put_nowait((event, None))
 
     async def dock(self) -> State:
-        """Run from OFFLINE to a final state and release the devices."""
+        """Run from OFFLINE to a final state and release the devices; a defect in an effect is raised when they are."""
         self.post(Event.LOAD)
         asked: set[State] = set()
         try:
@@ -44,6 +45,8 @@ class Cell:
                 self._activity.cancel()
                 await asyncio.gather(self._activity, return_exceptions=True)
             await self.procedure.close()
+        if self._defect is not None:
+            raise self._defect
         return self.situation.state
 
     def _handle(self, event: Event, error: DockingError | None) -> None:
@@ -64,9 +67,18 @@ class Cell:
         verb = REQUESTS.get(effect)
         if verb is None:
             self._activity = asyncio.get_running_loop().create_task(self._perform(effect))
+            self._activity.add_done_callback(self._ended)
             return
         self.procedure.journal.write("command", {"verb": verb})
-        self.procedure.motion.request(verb)
+        # A move that has just ended takes no more requests: one kept for later would hold or stop the next move.
+        if self._activity is not None and not self._activity.done():
+            self.procedure.motion.request(verb)
+
+    def _ended(self, activity: asyncio.Task[None]) -> None:
+        """A defect (an error that is not the cell's own) ends the run as a fault; nothing may wait for it for ever."""
+        if not activity.cancelled() and activity.exception() is not None:
+            self._defect = activity.exception()
+            self._events.put_nowait((Event.FAULTED, None))
 
     async def _perform(self, effect: Effect) -> None:
         error: DockingError | None = None

@@ -105,11 +105,11 @@ class Motion(Protocol):
         ...
 
     def request(self, verb: str) -> None:
-        """`hold`, `resume` or `stop`, all on the path. Never waits."""
+        """`hold`, `resume` or `stop`, all on the path. Never waits; kept for the start when it comes before it."""
         ...
 
     def feedback(self) -> Feedback:
-        """The newest read-back."""
+        """The newest read-back. Raises the fault that the motion side holds until the next `enable`."""
         ...
 
     async def close(self) -> None: ...

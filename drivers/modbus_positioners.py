@@ -175,11 +175,16 @@ class ModbusPositioners:
                 for plc in self._plcs:
                     plc.abandon()
             try:
-                await self._all(plc.command(verb) for plc in self._plcs if verb != "reset" or plc.state == "fault")
+                await self._all(plc.command(verb) for plc in self._plcs if self._concerns(verb, plc))
             except DockingError:
                 if verb in ("run", "resume"):
                     await asyncio.gather(*(plc.command("hold") for plc in self._plcs), return_exceptions=True)
                 raise
+
+    @staticmethod
+    def _concerns(verb: str, plc: PositionerPlc) -> bool:
+        """A reset is for those in fault; a resume for those that a hold caught before the end of their queue."""
+        return plc.state == "fault" if verb == "reset" else not (verb == "resume" and plc.state == "done")
 
     async def poll(self) -> Feedback:
         """One cycle: heartbeat and next segment out, status in, from all PLCs at once.

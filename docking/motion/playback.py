@@ -33,6 +33,10 @@ class Playback:
         self._from, self._to, self._since = self.rate, rate, 0.0
         self._span = 1.5 * abs(rate - self.rate) / self.plan.rate_slew_per_s
 
+    def wait(self) -> None:
+        """Stand where it is until the rate is turned up."""
+        self.rate = self._from = self._to = 0.0
+
     @property
     def at_end(self) -> bool:
         return self.path_time_s >= self.plan.duration_s

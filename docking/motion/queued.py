@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+from collections import deque
 
 import numpy as np
 
@@ -11,11 +13,13 @@ from docking.motion.monitors import Watch
 from docking.motion.playback import Playback
 from docking.motion.recorder import Recorder
 from docking.ports import QueuedPositioners
-from docking.types import Array, Feedback, Identity, MoveResult, Plan
+from docking.types import Array, AxisState, Feedback, Identity, MoveResult, Plan
 
 START_TOLERANCE_MM = 0.02
 STANDSTILL_MM = 0.002
 END_POLLS = 3
+END_S = 1e-6
+TRACE_PERIOD_S = 0.1
 
 
 class QueuedMotion:
@@ -27,68 +31,107 @@ class QueuedMotion:
         self._commanded: Array = np.zeros(len(self.axes))
         self._feedback: Feedback | None = None
         self._playback: Playback | None = None
-        self._verbs: asyncio.Queue[str] = asyncio.Queue()
+        self._verbs: deque[str] = deque()
         self._idle: asyncio.Task[None] | None = None
         self._cause: DockingError | None = None
         self._moving = False
+        self._still = 0
 
     async def connect(self) -> tuple[Identity, ...]:
         return await self._bus.bring_up()
 
     async def enable(self) -> Array:
+        if self._moving:
+            raise PlanStale("motion", "a move is running")
+        await self._end_idle()
         self._feedback = await self._bus.enable()
         self._commanded = np.array(self._feedback.position_mm)
         self._commanded.setflags(write=False)
-        self._cause = None
+        self._cause = self._playback = None
+        self._verbs.clear()
         self._watch.watch_about(self._commanded)
         self._idle = asyncio.get_running_loop().create_task(self._keep_alive())
         return self._commanded
 
     async def load(self, plan: Plan) -> None:
         if self._cause is not None:
-            raise PlanStale(plan.stage, f"the motion side holds a fault: {self._cause}")
+            raise self._cause
+        if self._moving:
+            raise PlanStale(plan.stage, "a move is running")
         gap = float(np.max(np.abs(plan.q_mm[0] - self._commanded)[self._watch.driven]))
         if not (gap <= START_TOLERANCE_MM):
             raise PlanStale(plan.stage, f"it starts {gap:.4f} mm from where the axes are commanded")
         self._watch.watch_about(plan.q_mm[0])
         await self._bus.load(plan)
         self._playback = Playback(plan)
+        await self._read(self._playback)
 
     async def start(self, plan_hash: str) -> MoveResult:
-        playback = self._playback
+        if self._cause is not None:
+            raise self._cause
+        if self._moving:
+            raise PlanStale("motion", "a move is running")
+        playback, self._playback = self._playback, None
         if playback is None or playback.plan.plan_hash != plan_hash:
-            raise PlanStale("motion", "another plan is loaded")
-        recorder = Recorder(self._watch, max(1, round(0.1 / self._poll_s)))
-        while not self._verbs.empty():
-            self._verbs.get_nowait()
+            raise PlanStale("motion", "this plan is not loaded")
+        recorder = Recorder(self._watch, max(1, round(TRACE_PERIOD_S / self._poll_s)))
         self._moving = True
         try:
-            await self._bus.command("run")
             outcome = await self._play(playback, recorder)
         except DockingError as error:
             self._cause = self._cause or error
             outcome = "fault"
+            await self._stop_all()
+        except asyncio.CancelledError:
+            # Nobody waits for this move any more, so nobody watches it.
+            await self._stop_all()
+            raise
         finally:
-            self._moving, self._playback = False, None
+            self._moving = False
+            self._verbs.clear()
         return self._result(outcome, playback, recorder)
 
     async def _play(self, playback: Playback, recorder: Recorder) -> str:
-        stop_asked, still = False, 0
-        before = self.feedback().position_mm
+        if not await self._set_off():
+            return "stopped"
+        stop_asked, self._still = False, 0
+        before = await self._read(playback)
         while True:
             await asyncio.sleep(self._poll_s)
             feedback = await self._read(playback)
             recorder.add(feedback, feedback.path_time_s)
-            stop_asked = await self._obey(stop_asked)
-            still = still + 1 if np.max(np.abs(feedback.position_mm - before)) <= STANDSTILL_MM else 0
-            before = feedback.position_mm
-            if still >= END_POLLS:
+            self._count_still(before, feedback)
+            before = feedback
+            ended = feedback.path_time_s >= playback.plan.duration_s - END_S
+            stop_asked = await self._obey(feedback, stop_asked, ended)
+            if self._still < END_POLLS:
+                continue
+            if self._cause is not None:
+                return "fault"
+            if ended or stop_asked:
+                return "done" if ended else "stopped"
+
+    async def _set_off(self) -> bool:
+        """Give the common start, after a hold that came before it is over; False when a stop came before it."""
+        held = False
+        while self._verbs or held:
+            while self._verbs:
+                verb = self._verbs.popleft()
+                if verb == "stop":
+                    return False
+                held = verb == "hold"
+            if held:
+                await asyncio.sleep(self._poll_s)
+                await self._read(None)
                 if self._cause is not None:
-                    return "fault"
-                if feedback.path_time_s >= playback.plan.duration_s - 1e-6:
-                    return "done"
-                if stop_asked:
-                    return "stopped"
+                    raise self._cause
+        await self._command("run")
+        return True
+
+    def _count_still(self, before: Feedback, now: Feedback) -> None:
+        moved = np.abs(now.position_mm - before.position_mm)
+        resting = AxisState.STOPPING not in now.states and np.max(moved) <= STANDSTILL_MM
+        self._still = self._still + 1 if resting else 0
 
     async def _read(self, playback: Playback | None) -> Feedback:
         feedback = await self._bus.poll()
@@ -101,20 +144,35 @@ class QueuedMotion:
         if cause is not None and self._cause is None:
             self._cause = cause
             if self._moving:
-                await self._bus.command("stop")
+                await self._command("stop")
         return feedback
 
-    async def _obey(self, stop_asked: bool) -> bool:
-        while not self._verbs.empty():
-            verb = self._verbs.get_nowait()
-            if verb == "resume" and (stop_asked or self._cause is not None):
-                continue
-            await self._bus.command(verb)
-            stop_asked = stop_asked or verb == "stop"
-        return stop_asked
+    async def _obey(self, feedback: Feedback, stop_asked: bool, ended: bool) -> bool:
+        """Pass on one verb, so that the next is judged by a read-back that shows its effect."""
+        if not self._verbs:
+            return stop_asked
+        if self._verbs[0] == "resume":
+            if AxisState.STOPPING in feedback.states:
+                return stop_asked
+            self._verbs.popleft()
+            if not (stop_asked or ended or self._cause is not None):
+                await self._command("resume")
+            return stop_asked
+        verb = self._verbs.popleft()
+        await self._command(verb)
+        return stop_asked or verb == "stop"
+
+    async def _command(self, verb: str) -> None:
+        self._still = 0
+        await self._bus.command(verb)
+
+    async def _stop_all(self) -> None:
+        """Have those controllers that still listen ramp down; the others follow the common line or their watchdogs."""
+        with contextlib.suppress(DockingError):
+            await self._command("stop")
 
     def _result(self, outcome: str, playback: Playback, recorder: Recorder) -> MoveResult:
-        path_time = self.feedback().path_time_s
+        path_time = self._feedback.path_time_s if self._feedback is not None else float("nan")
         self._commanded = playback.chord_at(path_time) if path_time >= 0.0 else self._commanded
         return recorder.result(outcome, path_time, self._commanded, self._cause)
 
@@ -130,16 +188,24 @@ class QueuedMotion:
                 return
 
     def request(self, verb: str) -> None:
-        self._verbs.put_nowait(verb)
+        if verb != "resume":
+            # A hold or a stop overtakes a resume that still waits for the end of a ramp.
+            self._verbs.clear()
+        self._verbs.append(verb)
 
     def feedback(self) -> Feedback:
+        if self._cause is not None:
+            raise self._cause
         if self._feedback is None:
             raise PlanStale("motion", "the positioners are not enabled")
         return self._feedback
 
     async def close(self) -> None:
+        await self._end_idle()
+        await self._bus.close()
+
+    async def _end_idle(self) -> None:
         if self._idle is not None:
             self._idle.cancel()
             await asyncio.gather(self._idle, return_exceptions=True)
             self._idle = None
-        await self._bus.close()

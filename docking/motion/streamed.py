@@ -27,6 +27,7 @@ class _Move:
     playback: Playback
     recorder: Recorder
     done: asyncio.Future[MoveResult]
+    over: asyncio.Event
     stop_asked: bool = False
 
 
@@ -43,6 +44,7 @@ class StreamedMotion:
         self._loaded: Playback | None = None
         self._move: _Move | None = None
         self._cause: DockingError | None = None
+        self._early: list[str] = []
         self._timer: asyncio.Handle | None = None
         self._deadline_s = 0.0
         self._judged: Feedback | None = None
@@ -51,10 +53,14 @@ class StreamedMotion:
         return await self._bus.bring_up()
 
     async def enable(self) -> Array:
+        if self._move is not None:
+            raise PlanStale("motion", "a move is running")
+        self._end_ticks()
         feedback = await self._bus.enable()
         self._setpoint = readonly(feedback.position_mm)
         self._history.extend([self._setpoint] * 3)
-        self._feedback, self._cause = feedback, None
+        self._feedback, self._judged, self._loaded, self._cause = feedback, None, None, None
+        self._early.clear()
         self._watch.watch_about(self._setpoint)
         loop = asyncio.get_running_loop()
         self._deadline_s = loop.time()
@@ -63,7 +69,9 @@ class StreamedMotion:
 
     async def load(self, plan: Plan) -> None:
         if self._cause is not None:
-            raise PlanStale(plan.stage, f"the motion side holds a fault: {self._cause}")
+            raise self._cause
+        if self._move is not None:
+            raise PlanStale(plan.stage, "a move is running")
         gap = float(np.max(np.abs(plan.q_mm[0] - self._setpoint)[self._watch.driven]))
         if not (gap <= START_TOLERANCE_MM):
             raise PlanStale(plan.stage, f"it starts {gap:.4f} mm from where the axes are commanded")
@@ -71,18 +79,37 @@ class StreamedMotion:
         self._loaded = Playback(plan)
 
     async def start(self, plan_hash: str) -> MoveResult:
+        if self._cause is not None:
+            raise self._cause
+        if self._move is not None:
+            raise PlanStale("motion", "a move is running")
         playback, self._loaded = self._loaded, None
         if playback is None or playback.plan.plan_hash != plan_hash:
-            raise PlanStale("motion", "another plan is loaded")
+            raise PlanStale("motion", "this plan is not loaded")
         recorder = Recorder(self._watch, max(1, round(TRACE_PERIOD_S / self._cycle_s)))
         done: asyncio.Future[MoveResult] = asyncio.get_running_loop().create_future()
-        self._move = _Move(playback, recorder, done)
-        return await done
+        self._move = _Move(playback, recorder, done, asyncio.Event())
+        if self._early:
+            playback.wait()
+        for verb in self._early:
+            self._obey(self._move, verb)
+        try:
+            return await done
+        except asyncio.CancelledError:
+            # Nobody waits for this move any more, so nobody watches it.
+            self.request("stop")
+            raise
+        finally:
+            self._early.clear()
 
     def request(self, verb: str) -> None:
-        move = self._move
-        if move is None:
-            return
+        if self._move is None:
+            # A hold that comes before the first set-point counts from the first set-point on.
+            self._early.append(verb)
+        else:
+            self._obey(self._move, verb)
+
+    def _obey(self, move: _Move, verb: str) -> None:
         if verb == "resume":
             if not move.stop_asked and self._cause is None:
                 move.playback.turn_to(1.0)
@@ -91,20 +118,43 @@ class StreamedMotion:
         move.playback.turn_to(0.0)
 
     def feedback(self) -> Feedback:
+        if self._cause is not None:
+            raise self._cause
         if self._feedback is None:
             raise PlanStale("motion", "the positioners are not enabled")
         return self._feedback
 
     async def close(self) -> None:
+        if self._move is not None:
+            over = self._move.over
+            self.request("stop")
+            await over.wait()
+        self._end_ticks()
+        await self._bus.close()
+
+    def _end_ticks(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        await self._bus.close()
 
     def _tick(self) -> None:
+        self._timer = None
+        move = self._move
+        try:
+            self._cycle(move)
+        except DockingError as error:
+            self._give_up(error, move)
+        except Exception as error:
+            # A defect: no more set-points, so the drives stop by themselves, and whoever waits for the move learns why.
+            if move is not None:
+                self._end(move)
+                if not move.done.done():
+                    move.done.set_exception(error)
+            raise
+
+    def _cycle(self, move: _Move | None) -> None:
         loop = asyncio.get_running_loop()
         now = loop.time()
-        move = self._move
         if move is not None:
             self._setpoint = move.playback.advance(self._cycle_s)
         self._history.append(self._setpoint)
@@ -118,6 +168,13 @@ class StreamedMotion:
         # Missed deadlines are skipped, never made up for in a burst.
         self._deadline_s = max(self._deadline_s + self._cycle_s, now)
         self._timer = loop.call_at(self._deadline_s, self._tick)
+
+    def _give_up(self, error: DockingError, move: _Move | None) -> None:
+        """The bus takes no set-points any more: the drives stop by themselves, the ticks end."""
+        self._cause = self._cause or error
+        self._bus.quick_stop()
+        if move is not None:
+            self._finish(move, "fault")
 
     def _judge(self, feedback: Feedback, move: _Move | None) -> DockingError | None:
         if move is None:
@@ -146,11 +203,17 @@ class StreamedMotion:
         stopped = playback.standing and (move.stop_asked or self._cause is not None)
         if not (playback.at_end or stopped):
             return
-        outcome = "fault" if self._cause else "stopped" if stopped else "done"
-        result = move.recorder.result(outcome, playback.path_time_s, self._setpoint, self._cause)
-        self._move = None
+        self._finish(move, "fault" if self._cause else "stopped" if stopped else "done")
+
+    def _finish(self, move: _Move, outcome: str) -> None:
+        result = move.recorder.result(outcome, move.playback.path_time_s, self._setpoint, self._cause)
+        self._end(move)
         if not move.done.done():
             move.done.set_result(result)
+
+    def _end(self, move: _Move) -> None:
+        self._move = None
+        move.over.set()
 
 
 def _same(before: Feedback, now: Feedback) -> bool:

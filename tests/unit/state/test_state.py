@@ -158,7 +158,7 @@ def test_wherever_a_move_is_planned_or_confirmed_the_pose_is_known():
 def test_only_a_fit_makes_the_pose_known():
     for situation in reachable(Situation(), without={E.FITTED}):
         assert not situation.position_known, situation
-    for (state, event), _ in expected().items():
+    for state, event in expected():
         situation, _ = step(Situation(state, position_known=False), event)
         assert situation.position_known == (event is E.FITTED), (state, event)
 
