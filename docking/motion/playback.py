@@ -39,7 +39,7 @@ class Playback:
 
     @property
     def at_end(self) -> bool:
-        return self.path_time_s >= self.plan.duration_s
+        return self.path_time_s >= self.plan.duration_s - ROW_S
 
     @property
     def standing(self) -> bool:
@@ -59,7 +59,7 @@ class Playback:
 
     def setpoint_at(self, path_time_s: float) -> Array:
         """The set-point (m,) at a path time; clamped to the ends of the table."""
-        row = round(path_time_s / self._period)
+        row = max(0, round(path_time_s / self._period))
         if row >= self._last:
             end: Array = self._q[self._last]
             return end
