@@ -17,10 +17,13 @@ EXPECTED = """
 OFFLINE           LOAD                 STANDBY
 STANDBY           CONNECT              STANDBY           CONNECT
 STANDBY           CONNECTED            DISABLED
+STANDBY           ABORT                RECOVER
 DISABLED          ENABLE               DISABLED          ENABLE
 DISABLED          ENABLED              IDLE
+DISABLED          ABORT                RECOVER
 IDLE              START_SEATED         MEASURE_FRAME     LOCATE
 IDLE              START_EMPTY          HOMING            HOME
+IDLE              ABORT                RECOVER
 HOMING            HOMED                HOMED
 HOMED             MEASURE_FRAME        MEASURE_FRAME     LOCATE
 MEASURE_FRAME     FRAME_MEASURED       MEASURE           MEASURE
