@@ -163,8 +163,10 @@ TABLE: dict[tuple[State, Event], Transition] = {
     (S.OUT_OF_TOLERANCE, E.CLOSE): Transition(S.STANDBY),
 }
 
-AT_REST = frozenset({S.MEASURE_FRAME, S.MEASURE, S.FIT, S.VERIFY, S.PLAN, S.CONFIRM, S.SETTLE})
-"""States with drives enabled and nothing moving, from which the operator can leave at once."""
+AT_REST = frozenset(
+    {S.STANDBY, S.DISABLED, S.IDLE, S.MEASURE_FRAME, S.MEASURE, S.FIT, S.VERIFY, S.PLAN, S.CONFIRM, S.SETTLE}
+)
+"""States with nothing moving, from which the operator can leave at once."""
 
 TABLE |= {(state, E.ABORT): Transition(S.RECOVER) for state in AT_REST}
 TABLE |= {(state, E.FAULTED): Transition(S.FAULT) for state in S if state is not S.FAULT}

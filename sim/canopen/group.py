@@ -192,7 +192,7 @@ class DriveGroup:
             self._arm_sync_monitor(now_s)
 
     def _sync_time_s(self) -> float:
-        """When this SYNC came. Of several that waited until this process got the CPU, each came a cycle before the next."""
+        """When this SYNC came; several that waited until this process got the CPU came a cycle apart."""
         now_s = self._loop.time()
         if not self._settings.shared_cpu or self._sync_s is None:
             return now_s
