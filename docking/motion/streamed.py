@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -17,6 +18,7 @@ from docking.types import Array, Feedback, Identity, MoveResult, Plan, readonly
 
 START_TOLERANCE_MM = 0.01
 LATE_LIMIT_CYCLES = 20
+SHORTEST_CYCLE = 0.9
 TRACE_PERIOD_S = 0.1
 
 
@@ -165,8 +167,9 @@ class StreamedMotion:
             self._trip(cause, move)
         if move is not None:
             self._follow(move, feedback)
-        # Missed deadlines are skipped, never made up for in a burst.
-        self._deadline_s = max(self._deadline_s + self._cycle_s, now)
+        # Missed deadlines are skipped, never made up for in a burst; the next is at least half a cycle away.
+        missed = max(0, math.floor((now - self._deadline_s) / self._cycle_s + 0.5))
+        self._deadline_s += (1 + missed) * self._cycle_s
         self._timer = loop.call_at(self._deadline_s, self._tick)
 
     def _give_up(self, error: DockingError, move: _Move | None) -> None:

@@ -1,0 +1,143 @@
+"""In-memory positioners for the tests of the motion side: set-points in, read-backs out, faults at will."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+
+import numpy as np
+
+from docking.errors import DeviceRefused, DockingError
+from docking.kinematics import Positioners
+from docking.motion.monitors import Watch, WatchLimits
+from docking.types import Array, AxisState, Feedback, Identity, Plan
+
+LIMITS = WatchLimits(
+    following_rest_mm=0.1,
+    following_vmax_mm=0.5,
+    ball_residual_mm=0.1,
+    internal_force_n=1500.0,
+    warp_force_n=300.0,
+    missing_cycles=2,
+)
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def watch_of(positioners: Positioners, limits: WatchLimits = LIMITS) -> Watch:
+    return Watch(positioners, UP, limits)
+
+
+def read_back(position_mm: Array, **changes: object) -> Feedback:
+    """A healthy read-back of axes at `position_mm` (m,); `changes` by field name."""
+    count = len(position_mm)
+    fields: dict[str, object] = {
+        "t_s": 0.0,
+        "position_mm": position_mm,
+        "following_error_mm": np.zeros(count),
+        "force_n": np.full(count, np.nan),
+        "states": (AxisState.ENABLED,) * count,
+        "age_cycles": np.zeros(count),
+    }
+    return Feedback(**(fields | changes))  # type: ignore[arg-type]
+
+
+class StreamedFake:
+    """Drives that stand where the set-point of two cycles ago told them to."""
+
+    def __init__(self, axes: tuple[str, ...], start_mm: Array, cycle_s: float = 0.01) -> None:
+        self.axes, self.cycle_s = axes, cycle_s
+        self.sent: list[Array] = []
+        self.sent_at_s: list[float] = []
+        self.changes: dict[str, object] = {}
+        self.offset_mm = np.zeros(len(axes))
+        self.error: Exception | None = None
+        self.quick_stops = self.enables = 0
+        self.closed = False
+        self._pipe = deque([start_mm] * 2, maxlen=2)
+
+    async def bring_up(self) -> tuple[Identity, ...]:
+        return (Identity("axis A.X", "fake", "drive", "1", "1"),)
+
+    async def enable(self) -> Feedback:
+        await asyncio.sleep(2.0 * self.cycle_s)
+        self.enables += 1
+        return read_back(self._pipe[0] + self.offset_mm)
+
+    def exchange(self, setpoint_mm: Array) -> Feedback:
+        if self.error is not None:
+            raise self.error
+        feedback = read_back(self._pipe[0] + self.offset_mm, **self.changes)
+        self._pipe.append(setpoint_mm)
+        self.sent.append(np.array(setpoint_mm))
+        self.sent_at_s.append(asyncio.get_running_loop().time())
+        return feedback
+
+    def quick_stop(self) -> None:
+        self.quick_stops += 1
+
+    async def close(self) -> None:
+        self.closed = True
+
+
+class QueuedFake:
+    """Controllers that play one queue along chords; a stop takes `ramp_s`, a resume before its end is refused."""
+
+    def __init__(self, axes: tuple[str, ...], start_mm: Array, segment_s: float = 0.1, ramp_s: float = 0.5) -> None:
+        self.axes, self.segment_s, self.ramp_s = axes, segment_s, ramp_s
+        self.verbs: list[str] = []
+        self.changes: dict[str, object] = {}
+        self.offset_mm = np.zeros(len(axes))
+        self.error: DockingError | None = None
+        self.closed = False
+        self.loaded: Plan | None = None
+        self._start_mm = start_mm
+        self._path_s = self._rate = self._goal = self._seen_s = 0.0
+
+    async def bring_up(self) -> tuple[Identity, ...]:
+        return (Identity("positioner A", "fake", "PLC", "1", "1"),)
+
+    async def enable(self) -> Feedback:
+        return await self.poll()
+
+    async def load(self, plan: Plan) -> None:
+        self.loaded, self._path_s, self._rate, self._goal = plan, 0.0, 0.0, 0.0
+
+    async def command(self, verb: str) -> None:
+        if self.error is not None:
+            raise self.error
+        self._advance()
+        if verb == "resume" and not (self._rate == 0.0 and self._goal == 0.0):
+            raise DeviceRefused("positioner A", "resume while it is stopping", value=4)
+        self.verbs.append(verb)
+        self._goal = 1.0 if verb in ("run", "resume") else 0.0
+        if verb == "run":
+            self._rate = 1.0
+
+    async def poll(self) -> Feedback:
+        if self.error is not None:
+            raise self.error
+        self._advance()
+        stopping = self._goal < self._rate
+        states = (AxisState.STOPPING if stopping else AxisState.ENABLED,) * len(self.axes)
+        fields = {"states": states, "path_time_s": self._path_s if self.loaded is not None else float("nan")}
+        return read_back(self.position_mm() + self.offset_mm, **(fields | self.changes))
+
+    async def close(self) -> None:
+        self.closed = True
+
+    def position_mm(self) -> Array:
+        if self.loaded is None:
+            return self._start_mm
+        return np.array([np.interp(self._path_s, self.loaded.t_s, column) for column in self.loaded.q_mm.T])
+
+    def _advance(self) -> None:
+        now_s = asyncio.get_running_loop().time()
+        while self._seen_s < now_s - 1e-9:
+            step_s = min(0.01, now_s - self._seen_s)
+            before = self._rate
+            change = np.clip(self._goal - before, -step_s / self.ramp_s, step_s / self.ramp_s)
+            self._rate = self._goal if abs(self._goal - before - change) < 1e-9 else before + float(change)
+            self._path_s += 0.5 * (before + self._rate) * step_s
+            self._seen_s += step_s
+        if self.loaded is not None and self._path_s >= self.loaded.duration_s:
+            self._path_s, self._rate, self._goal = self.loaded.duration_s, 0.0, 0.0

@@ -1,0 +1,217 @@
+"""Every limit trips just over its value, not just under it, on NaN always, and names what it is about."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from docking.errors import (
+    BallForceTrip,
+    ConsistencyTrip,
+    DriveFault,
+    FeedbackMissing,
+    FollowingErrorTrip,
+    InternalForceTrip,
+    WarpTrip,
+)
+from tests.reference_geometry import AXES, rc1
+from tests.support.motion_fakes import LIMITS, read_back, watch_of
+from tests.support.planned_moves import lab_site
+from tests.support.rigid_figure import sockets_mm
+
+Q = np.zeros(12)
+WIDE = replace(LIMITS, following_rest_mm=9.0, following_vmax_mm=9.0, ball_residual_mm=9.0, internal_force_n=9e9)
+WIDE = replace(WIDE, warp_force_n=9e9)
+K = 20000.0
+"""Stiffness of every axis of RC-1, N/mm."""
+
+
+def rc1_watch(limits=LIMITS):
+    """RC-1 with axes along W: what a pattern of deviations means there can be told by hand."""
+    watch = watch_of(rc1(), limits)
+    watch.watch_about(Q)
+    return watch
+
+
+def pattern(axis: int, a: float, b: float, c: float, d: float):
+    """Deviations (12,) of axis 0, 1, 2 of the four positioners."""
+    q = np.zeros(12)
+    q[axis::3] = (a, b, c, d)
+    return q
+
+
+def test_a_healthy_read_back_trips_nothing():
+    watch = rc1_watch()
+    assert watch.evaluate(read_back(Q), Q, 0.0) is None
+    assert (watch.max_residual_mm, watch.max_internal_force_n) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("row", range(12))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_following_error_at_rest(row, sign):
+    errors = np.zeros(12)
+    errors[row] = sign * 0.0999
+    assert rc1_watch().evaluate(read_back(Q, following_error_mm=errors), Q, 0.0) is None
+    errors[row] = sign * 0.1001
+    trip = rc1_watch().evaluate(read_back(Q, following_error_mm=errors), Q, 0.0)
+    assert isinstance(trip, FollowingErrorTrip)
+    assert trip.where == AXES[row]
+    assert trip.value == pytest.approx(sign * 0.1001)
+    assert trip.limit == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(("speed", "limit"), [(10.0, 0.5), (5.0, 0.3), (0.0, 0.1)])
+def test_following_error_is_allowed_to_grow_with_the_speed_of_its_own_axis(speed, limit):
+    speeds = np.zeros(12)
+    speeds[4] = speed
+    errors = np.zeros(12)
+    errors[4] = limit - 0.001
+    assert rc1_watch().evaluate(read_back(Q, following_error_mm=errors), Q, speeds) is None
+    errors[4] = limit + 0.001
+    trip = rc1_watch().evaluate(read_back(Q, following_error_mm=errors), Q, speeds)
+    assert isinstance(trip, FollowingErrorTrip)
+    assert trip.where == "B.Y"
+    speeds[:] = (10.0,) * 12
+    speeds[4] = speed
+    assert isinstance(rc1_watch().evaluate(read_back(Q, following_error_mm=errors), Q, speeds), FollowingErrorTrip)
+
+
+def test_a_passive_axis_has_no_set_point_to_follow():
+    driven = np.ones(12, dtype=bool)
+    driven[3] = False
+    watch = watch_of(rc1(driven=driven))
+    watch.watch_about(Q)
+    errors = np.zeros(12)
+    errors[3] = 5.0
+    assert watch.evaluate(read_back(Q, following_error_mm=errors), Q, 0.0) is None
+
+
+@pytest.mark.parametrize("row", range(12))
+def test_nan_in_any_following_error_trips(row):
+    errors = np.zeros(12)
+    errors[row] = np.nan
+    trip = rc1_watch(WIDE).evaluate(read_back(Q, following_error_mm=errors), Q, 0.0)
+    assert isinstance(trip, FollowingErrorTrip)
+    assert trip.where == AXES[row]
+
+
+@pytest.mark.parametrize("row", range(12))
+def test_nan_in_any_position_trips(row):
+    position = np.zeros(12)
+    position[row] = np.nan
+    assert isinstance(rc1_watch(WIDE).evaluate(read_back(position), Q, 0.0), ConsistencyTrip)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_stretched_figure_trips_on_its_residual(axis):
+    # A and B lie at -3000 and 3000 along X, D and C likewise; A, D and B, C at -1800 and 1800 along Y.
+    stretch = (-1.0, 1.0, 1.0, -1.0) if axis == 0 else (-1.0, -1.0, 1.0, 1.0)
+    watch = rc1_watch(replace(WIDE, ball_residual_mm=0.1))
+    assert watch.evaluate(read_back(pattern(axis, *np.multiply(0.0999, stretch))), Q, 0.0) is None
+    assert watch.residual_mm == pytest.approx(0.0999, rel=1e-9)
+    trip = watch.evaluate(read_back(pattern(axis, *np.multiply(0.1001, stretch))), Q, 0.0)
+    assert isinstance(trip, ConsistencyTrip)
+    assert trip.value == pytest.approx(0.1001, rel=1e-9)
+    assert trip.limit == pytest.approx(0.1)
+
+
+def test_a_stretched_figure_trips_on_the_force_that_it_means():
+    watch = rc1_watch(replace(WIDE, internal_force_n=1500.0))
+    under, over = 0.99 * 1500.0 / K, 1.01 * 1500.0 / K
+    assert watch.evaluate(read_back(pattern(0, -under, under, under, -under)), Q, 0.0) is None
+    trip = watch.evaluate(read_back(pattern(0, -over, over, over, -over)), Q, 0.0)
+    assert isinstance(trip, InternalForceTrip)
+    assert trip.value == pytest.approx(1.01 * 1500.0, rel=1e-6)
+    assert watch.max_internal_force_n == pytest.approx(1.01 * 1500.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_twisted_table_trips_on_warp(sign):
+    watch = rc1_watch(replace(WIDE, warp_force_n=300.0))
+    under, over = sign * 0.99 * 300.0 / K, sign * 1.01 * 300.0 / K
+    assert watch.evaluate(read_back(pattern(2, under, -under, under, -under)), Q, 0.0) is None
+    trip = watch.evaluate(read_back(pattern(2, over, -over, over, -over)), Q, 0.0)
+    assert isinstance(trip, WarpTrip)
+    assert abs(trip.value) == pytest.approx(1.01 * 300.0, rel=1e-6)
+
+
+def test_deviations_that_move_the_whole_figure_are_no_coupling():
+    watch = rc1_watch(replace(WIDE, ball_residual_mm=1e-3, internal_force_n=1.0, warp_force_n=1.0))
+    assert watch.evaluate(read_back(np.tile([0.7, -0.4, 0.9], 4)), Q, 0.0) is None
+    tilt = pattern(2, -0.03, 0.03, 0.03, -0.03)
+    tilt += pattern(0, *np.multiply(0.03 / 3000.0, (0.0, 0.0, 0.0, 0.0)))
+    assert watch.evaluate(read_back(tilt), Q, 0.0) is None
+
+
+def test_the_figure_is_judged_against_the_reference_it_belongs_to():
+    watch = rc1_watch(replace(WIDE, ball_residual_mm=0.1))
+    there = pattern(0, -3.0, 3.0, 3.0, -3.0)
+    assert watch.evaluate(read_back(there), there, 0.0) is None
+    assert isinstance(watch.evaluate(read_back(there), Q, 0.0), ConsistencyTrip)
+
+
+def test_one_axis_out_in_a_crooked_cell_leaves_what_a_rigid_fit_leaves():
+    positioners = lab_site().positioners
+    watch = watch_of(positioners, WIDE)
+    watch.watch_about(Q)
+    where = positioners.origins_W_mm, positioners.axes_W
+    start = sockets_mm(*where, Q)[0]
+    out = np.zeros(12)
+    out[7] = 0.05
+    off = (sockets_mm(*where, out)[0] - start).reshape(-1)
+    arms = start - start.mean(axis=0)
+    moves = [np.tile(unit, (4, 1)) for unit in np.eye(3)] + [np.cross(unit, arms) for unit in np.eye(3)]
+    rigid = np.array([move.reshape(-1) for move in moves]).T
+    left = off - rigid @ np.linalg.lstsq(rigid, off, rcond=None)[0]
+    watch.evaluate(read_back(out), Q, 0.0)
+    assert watch.residual_mm == pytest.approx(np.linalg.norm(left.reshape(4, 3), axis=1).max(), rel=1e-6)
+    assert 0.01 < watch.residual_mm < 0.05
+
+
+def test_silence_longer_than_the_limit_trips_and_names_the_axis():
+    age = np.zeros(12)
+    age[8] = 2.0
+    assert rc1_watch().evaluate(read_back(Q, age_cycles=age), Q, 0.0) is None
+    age[8] = 3.0
+    trip = rc1_watch().evaluate(read_back(Q, age_cycles=age), Q, 0.0)
+    assert isinstance(trip, FeedbackMissing)
+    assert (trip.where, trip.value, trip.limit) == ("C.Z", 3.0, 2)
+    age[8] = np.nan
+    trip = rc1_watch(WIDE).evaluate(read_back(Q, age_cycles=age), Q, 0.0)
+    assert isinstance(trip, FeedbackMissing)
+    assert trip.where == "C.Z"
+
+
+def test_a_fault_of_a_drive_comes_before_what_follows_from_it():
+    errors = np.full(12, 9.0)
+    told = read_back(Q, fault=("D.Y", 0x7305, "encoder"), following_error_mm=errors)
+    trip = rc1_watch().evaluate(told, Q, 0.0)
+    assert isinstance(trip, DriveFault)
+    assert (trip.where, trip.value, trip.cause) == ("D.Y", 0x7305, "encoder")
+
+
+@pytest.mark.parametrize(("row", "rated"), [(0, 10000.0), (4, 10000.0), (11, 50000.0)])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_an_overloaded_ball_trips_and_names_the_axis(row, rated, sign):
+    force = np.full(12, np.nan)
+    force[row] = sign * 1.0999 * rated
+    assert rc1_watch().evaluate(read_back(Q, force_n=force), Q, 0.0) is None
+    force[row] = sign * 1.1001 * rated
+    trip = rc1_watch().evaluate(read_back(Q, force_n=force), Q, 0.0)
+    assert isinstance(trip, BallForceTrip)
+    assert trip.where == AXES[row]
+    assert trip.limit == pytest.approx(1.1 * rated)
+
+
+def test_maxima_are_kept_until_the_next_move():
+    watch = rc1_watch()
+    watch.evaluate(read_back(pattern(0, -0.02, 0.02, 0.02, -0.02), following_error_mm=np.full(12, -0.05)), Q, 0.0)
+    watch.evaluate(read_back(Q), Q, 0.0)
+    assert watch.max_residual_mm == pytest.approx(0.02)
+    assert watch.max_internal_force_n == pytest.approx(0.02 * K)
+    np.testing.assert_allclose(watch.max_following_mm, 0.05)
+    watch.reset_maxima()
+    assert (watch.max_residual_mm, watch.max_internal_force_n) == (0.0, 0.0)
+    np.testing.assert_array_equal(watch.max_following_mm, 0.0)

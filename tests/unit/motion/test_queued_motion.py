@@ -1,0 +1,320 @@
+"""Motion over controllers that play a queue: start, hold, stop, faults, and what may not be started."""
+
+from __future__ import annotations
+
+import asyncio
+
+import numpy as np
+import pytest
+
+from docking.errors import DeviceSilent, DriveFault, FollowingErrorTrip, LinkLost, PlanStale
+from docking.motion import QueuedMotion
+from sim.virtual_time import run_virtual
+from tests.support.motion_fakes import QueuedFake, watch_of
+from tests.support.planned_moves import a_plan, lab_site
+from tests.support.rigid_figure import path_gap_mm
+
+SITE = lab_site("lab-modbus")
+PLAN = a_plan(SITE, 3, period_s=0.1, queued=True)
+NEXT = a_plan(SITE, 4, period_s=0.1, queued=True, start_mm=np.array(PLAN.q_mm[-1]))
+POSITIONERS = SITE.positioners
+POLL_S, RAMP_S = 0.05, 0.5
+
+
+class Bench:
+    """A motion side, enabled, over the fake controllers."""
+
+    def __init__(self) -> None:
+        self.bus = QueuedFake(POSITIONERS.axes, np.array(PLAN.q_mm[0]), ramp_s=RAMP_S)
+        self.motion = QueuedMotion(self.bus, watch_of(POSITIONERS), POLL_S)
+
+    async def begin(self):
+        """Enable, load the plan, start it; returns the task of the move."""
+        await self.motion.enable()
+        await self.motion.load(PLAN)
+        return asyncio.get_running_loop().create_task(self.motion.start(PLAN.plan_hash))
+
+
+def on_bench(scenario):
+    """Run `scenario(bench)` in virtual time, close, and see that nothing is left over."""
+
+    async def main():
+        bench = Bench()
+        result = await scenario(bench)
+        await bench.motion.close()
+        assert bench.bus.closed
+        assert asyncio.all_tasks() == {asyncio.current_task()}
+        return result
+
+    return run_virtual(main)
+
+
+def after(seconds: float, call, *args) -> None:
+    asyncio.get_running_loop().call_later(seconds, call, *args)
+
+
+async def rests(bench) -> np.ndarray:
+    """Where the axes stand; they must stand still for two seconds."""
+    before = bench.bus.position_mm()
+    for _ in range(8):
+        await asyncio.sleep(0.25)
+        await bench.bus.poll()
+        np.testing.assert_array_equal(bench.bus.position_mm(), before)
+    return before
+
+
+def test_a_plan_is_played_to_its_end():
+    async def scenario(bench):
+        result = await (await bench.begin())
+        assert (result.result, result.cause) == ("done", None)
+        assert bench.bus.verbs == ["run"]
+        np.testing.assert_array_equal(result.commanded_mm, PLAN.q_mm[-1])
+        assert result.path_time_s == pytest.approx(PLAN.duration_s)
+        assert result.max_residual_mm <= 1e-9
+        await bench.motion.load(NEXT)
+        assert (await bench.motion.start(NEXT.plan_hash)).result == "done"
+
+    on_bench(scenario)
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.5, 0.75, 0.9])
+@pytest.mark.parametrize("pause_s", [0.0, 0.2, 0.45, 3.0])
+def test_a_hold_rests_and_a_resume_goes_to_the_end_however_soon_it_comes(share, pause_s):
+    async def scenario(bench):
+        move = await bench.begin()
+        await asyncio.sleep(share * PLAN.duration_s)
+        bench.motion.request("hold")
+        await asyncio.sleep(pause_s)
+        if pause_s > RAMP_S + 2 * POLL_S:
+            await rests(bench)
+        bench.motion.request("resume")
+        result = await move
+        assert (result.result, result.cause) == ("done", None)
+        assert bench.bus.verbs == ["run", "hold", "resume"]
+        np.testing.assert_array_equal(result.commanded_mm, PLAN.q_mm[-1])
+
+    on_bench(scenario)
+
+
+@pytest.mark.parametrize("share", [0.01, 0.05, 0.3, 0.5, 0.75])
+@pytest.mark.parametrize("held", [False, True])
+def test_a_stop_ends_the_move_where_the_axes_stand(share, held):
+    async def scenario(bench):
+        move = await bench.begin()
+        await asyncio.sleep(share * PLAN.duration_s)
+        if held:
+            bench.motion.request("hold")
+            await asyncio.sleep(2.0)
+        bench.motion.request("stop")
+        bench.motion.request("resume")
+        result = await move
+        stood = await rests(bench)
+        assert (result.result, result.cause) == ("stopped", None)
+        assert "resume" not in bench.bus.verbs
+        np.testing.assert_allclose(result.commanded_mm, stood, atol=1e-9)
+        assert path_gap_mm(PLAN.q_mm, stood).max() <= 1e-9
+        with pytest.raises(PlanStale):
+            await bench.motion.start(PLAN.plan_hash)
+
+    on_bench(scenario)
+
+
+def test_a_stop_is_over_only_when_the_ramp_is():
+    async def scenario(bench):
+        loop = asyncio.get_running_loop()
+        move = await bench.begin()
+        # So slow at the beginning that the read-backs seem to stand still.
+        await asyncio.sleep(0.01)
+        bench.motion.request("stop")
+        asked = loop.time()
+        await move
+        assert loop.time() - asked >= RAMP_S
+
+    on_bench(scenario)
+
+
+@pytest.mark.parametrize("loaded", [False, True])
+def test_a_stop_before_the_start_moves_nothing(loaded):
+    async def scenario(bench):
+        await bench.motion.enable()
+        if not loaded:
+            bench.motion.request("stop")
+        await bench.motion.load(PLAN)
+        if loaded:
+            bench.motion.request("stop")
+        result = await bench.motion.start(PLAN.plan_hash)
+        assert result.result == "stopped"
+        np.testing.assert_array_equal(result.commanded_mm, PLAN.q_mm[0])
+        np.testing.assert_array_equal(await rests(bench), PLAN.q_mm[0])
+        assert "run" not in bench.bus.verbs
+        # It was for that move alone.
+        await bench.motion.load(PLAN)
+        assert (await bench.motion.start(PLAN.plan_hash)).result == "done"
+
+    on_bench(scenario)
+
+
+@pytest.mark.parametrize("going", ["resume", "stop"])
+def test_a_hold_before_the_start_waits(going):
+    async def scenario(bench):
+        await bench.motion.enable()
+        await bench.motion.load(PLAN)
+        bench.motion.request("hold")
+        move = asyncio.get_running_loop().create_task(bench.motion.start(PLAN.plan_hash))
+        np.testing.assert_array_equal(await rests(bench), PLAN.q_mm[0])
+        bench.motion.request(going)
+        assert (await move).result == ("done" if going == "resume" else "stopped")
+
+    on_bench(scenario)
+
+
+def test_a_stop_overtakes_a_resume_that_waits():
+    async def scenario(bench):
+        move = await bench.begin()
+        await asyncio.sleep(0.5 * PLAN.duration_s)
+        bench.motion.request("hold")
+        await asyncio.sleep(0.2)
+        bench.motion.request("resume")
+        await asyncio.sleep(0.1)
+        bench.motion.request("stop")
+        assert (await move).result == "stopped"
+        assert bench.bus.verbs == ["run", "hold", "stop"]
+
+    on_bench(scenario)
+
+
+def assert_faulted(result, kind, where) -> None:
+    assert result.result == "fault"
+    assert isinstance(result.cause, kind)
+    assert result.cause.where == where
+
+
+@pytest.mark.parametrize("share", [0.01, 0.5])
+@pytest.mark.parametrize(
+    ("changes", "kind", "where"),
+    [
+        ({"following_error_mm": np.array([0.0] * 4 + [2.0] + [0.0] * 7)}, FollowingErrorTrip, "B.Y"),
+        ({"fault": ("C.X", 3, "following error")}, DriveFault, "C.X"),
+    ],
+)
+def test_a_trip_stops_all_and_ends_when_they_stand(share, changes, kind, where):
+    async def scenario(bench):
+        loop = asyncio.get_running_loop()
+        move = await bench.begin()
+        after(share * PLAN.duration_s, bench.bus.changes.update, changes)
+        begun = loop.time()
+        result = await move
+        assert_faulted(result, kind, where)
+        assert bench.bus.verbs == ["run", "stop"]
+        assert loop.time() - begun >= share * PLAN.duration_s + RAMP_S
+        assert path_gap_mm(PLAN.q_mm, await rests(bench)).max() <= 1e-9
+
+    on_bench(scenario)
+
+
+class Deaf(QueuedFake):
+    """Its polls fail, its commands arrive."""
+
+    async def poll(self):
+        if self.error is not None:
+            raise self.error
+        return await super().poll()
+
+    async def command(self, verb: str) -> None:
+        error, self.error = self.error, None
+        await super().command(verb)
+        self.error = error
+
+
+def test_when_a_read_back_is_lost_the_others_are_told_to_stop():
+    async def scenario(bench):
+        bench.bus.__class__ = Deaf
+        move = await bench.begin()
+        after(0.5 * PLAN.duration_s, setattr, bench.bus, "error", DeviceSilent("positioner B", "2 replies lost"))
+        assert_faulted(await move, DeviceSilent, "positioner B")
+        assert bench.bus.verbs == ["run", "stop"]
+
+    on_bench(scenario)
+
+
+@pytest.mark.parametrize("moving", [True, False])
+def test_a_lost_link_ends_the_move_and_is_told(moving):
+    async def scenario(bench):
+        lost = LinkLost("positioner B", "the connection broke")
+        if moving:
+            move = await bench.begin()
+            after(0.5 * PLAN.duration_s, setattr, bench.bus, "error", lost)
+            assert_faulted(await move, LinkLost, "positioner B")
+        else:
+            await bench.motion.enable()
+            bench.bus.error = lost
+            await asyncio.sleep(0.2)
+        with pytest.raises(LinkLost):
+            bench.motion.feedback()
+        with pytest.raises(LinkLost):
+            await bench.motion.load(PLAN)
+
+    on_bench(scenario)
+
+
+def test_a_fault_is_held_until_the_axes_are_enabled_again():
+    async def scenario(bench):
+        await bench.motion.enable()
+        await bench.motion.load(PLAN)
+        bench.bus.changes["fault"] = ("C.X", 3, "following error")
+        await asyncio.sleep(0.2)
+        bench.bus.changes.clear()
+        await asyncio.sleep(0.2)
+        for ask in (lambda: bench.motion.load(PLAN), lambda: bench.motion.start(PLAN.plan_hash)):
+            with pytest.raises(DriveFault):
+                await ask()
+        with pytest.raises(DriveFault):
+            bench.motion.feedback()
+        assert "run" not in bench.bus.verbs
+        await bench.motion.enable()
+        assert len(asyncio.all_tasks()) == 2, "two keepers run side by side"
+        await bench.motion.load(PLAN)
+        assert (await bench.motion.start(PLAN.plan_hash)).result == "done"
+
+    on_bench(scenario)
+
+
+def test_what_may_not_be_loaded_or_started_is_refused():
+    async def scenario(bench):
+        motion = bench.motion
+        with pytest.raises(PlanStale):
+            motion.feedback()
+        await motion.enable()
+        with pytest.raises(PlanStale):
+            await motion.load(NEXT)
+        with pytest.raises(PlanStale):
+            await motion.start(PLAN.plan_hash)
+        await motion.load(PLAN)
+        with pytest.raises(PlanStale):
+            await motion.start(NEXT.plan_hash)
+        await motion.load(PLAN)
+        move = asyncio.get_running_loop().create_task(motion.start(PLAN.plan_hash))
+        await asyncio.sleep(0.5)
+        for ask in (lambda: motion.load(PLAN), lambda: motion.start(PLAN.plan_hash), motion.enable):
+            with pytest.raises(PlanStale):
+                await ask()
+        assert (await move).result == "done"
+        assert bench.bus.verbs == ["run"]
+        with pytest.raises(PlanStale):
+            await motion.start(PLAN.plan_hash)
+
+    on_bench(scenario)
+
+
+def test_a_move_that_nobody_waits_for_is_stopped():
+    async def scenario(bench):
+        move = await bench.begin()
+        await asyncio.sleep(0.5 * PLAN.duration_s)
+        move.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await move
+        assert bench.bus.verbs == ["run", "stop"]
+        await asyncio.sleep(RAMP_S + 0.1)
+        assert path_gap_mm(PLAN.q_mm, await rests(bench)).max() <= 1e-9
+
+    on_bench(scenario)
