@@ -44,9 +44,7 @@ class Approach:
     def errors(self, X_WC: Fit, X_WM: Fit, station: Station, drift_sigma_mm: float) -> FeatureErrors:
         """Component features minus their places at `station` (f, 3) in W, with the whole uncertainty."""
         budget = Budget(drift_sigma_mm, self.component_expansion, self.mate_expansion)
-        errors = feature_errors(X_WC, X_WM, self.features, budget)
-        back = station.standoff_mm * self._axis_W(X_WM)
-        return FeatureErrors(errors.names, errors.error_mm + back, errors.sigma_mm, errors.tolerance_mm)
+        return feature_errors(X_WC, X_WM, self.features, budget, -station.standoff_mm * self._axis_W(X_WM))
 
     def correction(self, X_WC: Fit, X_WM: Fit, station: Station) -> Correction:
         """The move from the measured pose to the goal at `station`, about the docking face: the features on the mate's,

@@ -62,6 +62,7 @@ def features_record(errors: FeatureErrors, stage: str, when: str) -> dict[str, A
         "norm_mm": errors.norm_mm.tolist(),
         "sigma_mm": errors.sigma_mm.tolist(),
         "tolerance_mm": errors.tolerance_mm.tolist(),
+        "risk": errors.risk,
         "accepted": errors.accepted(),
     }
 

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from docking.errors import CorrectionTooLarge, Diverging, IterationsExhausted, PlanError, ToleranceUnprovable
 from docking.geometry import exp_so3, log_so3
-from docking.types import Array, Correction, FeatureErrors, Pose
+from docking.types import RISK_LIMIT, Array, Correction, FeatureErrors, Pose
 
 
 def correction_to(X_WC: Pose, X_WG: Pose, pivot_C_mm: ArrayLike) -> Correction:
@@ -88,13 +88,14 @@ class Attempt:
     sigma_mm: float
     tolerance_mm: float
     accepted: bool
+    risk: float = 0.0
 
 
 def attempt(errors: FeatureErrors, corrections: int, passes: int) -> Attempt:
     """The attempt that `errors` stand for."""
     i = errors.worst()
     numbers = float(errors.norm_mm[i]), float(errors.sigma_mm[i]), float(errors.tolerance_mm[i])
-    return Attempt(corrections, passes, *numbers, errors.accepted())
+    return Attempt(corrections, passes, *numbers, errors.accepted(), errors.risk)
 
 
 @dataclass(frozen=True)
@@ -143,7 +144,8 @@ def decide(history: Sequence[Attempt], settings: ConvergenceSettings, stage: str
         return verdict(Action.MEASURE_MORE, "the error is too small to move for, its sigma too large to accept")
     bound = last.error_mm + 2.0 * last.sigma_mm
     if last.error_mm < dead_band:
-        unprovable = ToleranceUnprovable(stage, value=bound, limit=last.tolerance_mm)
+        risk = f"The risk that a feature is out of tolerance is {last.risk:.1%}, at most {RISK_LIMIT:.1%} is accepted."
+        unprovable = ToleranceUnprovable(stage, risk, value=bound, limit=last.tolerance_mm)
         return verdict(Action.OUT_OF_TOLERANCE, "inside the dead-band, and all passes are spent", unprovable)
     before = _error_before_worse_twice(history)
     if before is not None:

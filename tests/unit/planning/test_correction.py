@@ -93,10 +93,10 @@ SETTINGS = ConvergenceSettings()
 
 def test_attempt_takes_the_feature_with_the_largest_bound() -> None:
     errors = FeatureErrors(
-        ("a", "b"), np.array([[0.1, 0, 0], [0, 0.06, 0.08]]), np.array([0.01, 0.03]), np.array([0.2, 0.2])
+        ("a", "b"), np.array([[0.1, 0, 0], [0, 0.06, 0.08]]), np.array([0.01, 0.03]), np.array([0.2, 0.2]), 0.001
     )
-    assert attempt(errors, 1, 2) == Attempt(1, 2, pytest.approx(0.1), 0.03, 0.2, True)
-    unknown = FeatureErrors(errors.names, errors.error_mm, np.array([0.01, np.nan]), errors.tolerance_mm)
+    assert attempt(errors, 1, 2) == Attempt(1, 2, pytest.approx(0.1), 0.03, 0.2, True, 0.001)
+    unknown = FeatureErrors(errors.names, errors.error_mm, np.array([0.01, np.nan]), errors.tolerance_mm, 0.0)
     assert not attempt(unknown, 1, 2).accepted
 
 
