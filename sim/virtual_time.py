@@ -21,40 +21,12 @@ T = TypeVar("T")
 LATENCY_S = 0.0002
 """One-way delay of an in-process TCP connection, about that of a small switched network."""
 
+SAME_INSTANT_S = 1e-9
+"""Timers no farther apart than this are due together: sums of cycles differ in their last bits only."""
+
 
 class NotInVirtualTime(RuntimeError):
     """Something tried to wait for the real world while time is virtual."""
-
-
-class _OrderedTimer(asyncio.TimerHandle):
-    """A timer that keeps the order of the calls when two fall on the same instant."""
-
-    __slots__ = ("_order",)
-    _count = itertools.count()
-
-    def __init__(self, when: float, callback: Any, args: Any, loop: Any, context: Context | None) -> None:
-        super().__init__(when, callback, args, loop, context)
-        self._order = next(self._count)
-
-    def __lt__(self, other: Any) -> bool:
-        return (self._when, self._order) < (other._when, other._order)  # type: ignore[attr-defined]
-
-
-class _JumpSelector:
-    """In place of waiting, moves the loop's time to its next timer."""
-
-    def __init__(self, loop: VirtualTimeLoop) -> None:
-        self._loop = loop
-
-    def select(self, timeout: float | None) -> list[Any]:
-        if timeout is None:
-            raise NotInVirtualTime("nothing is scheduled: every task waits for something that cannot come")
-        if timeout > 0.0:
-            self._loop.jump()
-        return []
-
-    def close(self) -> None:
-        return None
 
 
 class _MemoryTransport(asyncio.Transport):
@@ -142,29 +114,27 @@ class _MemoryServer(asyncio.AbstractServer):
 
 
 class VirtualTimeLoop(asyncio.BaseEventLoop):
-    """Event loop on virtual time; `time()` starts at 0 and moves only from timer to timer."""
+    """Event loop on virtual time; `time()` starts at 0 and moves only from timer to timer.
+
+    Two timers of the same instant run in the order in which they were set.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self._now = 0.0
-        self._selector = _JumpSelector(self)
+        self._timers: list[tuple[float, int, asyncio.TimerHandle]] = []
+        self._order = itertools.count()
         self._owner = threading.get_ident()
         self.servers: dict[tuple[str, int], _MemoryServer] = {}
 
     def time(self) -> float:
         return self._now
 
-    def jump(self) -> None:
-        """Move time to the next timer."""
-        when = self._scheduled[0]._when  # type: ignore[attr-defined]
-        self._now = max(self._now, when)
-
     def call_at(  # type: ignore[override]
         self, when: float, callback: Callable[..., Any], *args: Any, context: Context | None = None
     ) -> asyncio.TimerHandle:
-        timer = _OrderedTimer(when, callback, args, self, context)
-        heapq.heappush(self._scheduled, timer)  # type: ignore[attr-defined]
-        timer._scheduled = True  # type: ignore[attr-defined]
+        timer = asyncio.TimerHandle(when, callback, args, self, context)
+        heapq.heappush(self._timers, (when, next(self._order), timer))
         return timer
 
     def call_later(  # type: ignore[override]
@@ -186,11 +156,28 @@ class VirtualTimeLoop(asyncio.BaseEventLoop):
     def add_writer(self, fd: Any, callback: Any, *args: Any) -> None:  # type: ignore[override]
         raise NotInVirtualTime(f"a real file descriptor was to be watched: {fd!r}")
 
-    def _process_events(self, event_list: list[Any]) -> None:
-        return None
+    def _run_once(self) -> None:
+        """One round of the loop, as asyncio's own, but where that waits for a timer this moves time to it."""
+        ready: deque[asyncio.Handle] = self._ready  # type: ignore[attr-defined]
+        if not ready and not self._stopping:  # type: ignore[attr-defined]
+            self._jump()
+        timers, due = self._timers, self._now + SAME_INSTANT_S
+        while timers and timers[0][0] < due:
+            ready.append(heapq.heappop(timers)[2])
+        for _ in range(len(ready)):
+            handle = ready.popleft()
+            if not handle.cancelled():
+                handle._run()
 
-    def _write_to_self(self) -> None:
-        return None
+    def _jump(self) -> None:
+        """Move time to the next timer that is to run."""
+        timers = self._timers
+        while timers and timers[0][2].cancelled():
+            heapq.heappop(timers)
+        if not timers:
+            raise NotInVirtualTime("nothing is scheduled: every task waits for something that cannot come")
+        if timers[0][0] > self._now:
+            self._now = timers[0][0]
 
     async def create_server(self, protocol_factory: Any, host: Any = None, port: Any = None, **kwargs: Any) -> Any:
         """Listen on (host, port) inside the process."""

@@ -57,6 +57,7 @@ class CyclicImage:
         self._force_index = {self._map.pdos["force"].cob + n.node: n.index for n in self.nodes if n.load_cell}
         self._raw: list[bytes] = [bytes(codec.READ_BACK.itemsize)] * count
         self._joined: bytes | None = None
+        self._batch: list[CanFrame] | None = None
         self._decoded = b""
         self._seen = [_NEVER] * count
         self._force = np.full(count, np.nan)
@@ -131,14 +132,19 @@ class CyclicImage:
     def take_batch(self, batch: list[CanFrame]) -> Sequence[CanFrame]:
         """Take the read-backs out of a batch; return the frames that are something else."""
         count = len(self._cobs)
+        # The very list of the last cycle, unaltered by agreement, need not be read twice.
+        if batch is self._batch:
+            self._seen = [self.cycles] * count
+            return ()
         head = batch[:count]
         if [frame[0] for frame in head] == self._cobs:
             raw = [frame[1] for frame in head]
             joined = b"".join(raw)
             if len(joined) == count * 8:
-                self._raw, self._joined = raw, joined
+                self._raw, self._joined, self._batch = raw, joined, None
                 self._seen = [self.cycles] * count
                 if len(batch) == count:
+                    self._batch = batch
                     return ()
                 batch = batch[count:]
         return [frame for frame in batch if not self._take(frame)]
@@ -147,7 +153,7 @@ class CyclicImage:
         cob, data = frame
         index = self._index.get(cob)
         if index is not None and len(data) == 8:
-            self._raw[index], self._joined = data, None
+            self._raw[index], self._joined, self._batch = data, None, None
             self._seen[index] = self.cycles
             return True
         index = self._force_index.get(cob)
@@ -163,7 +169,7 @@ class CyclicImage:
         """Start from values read by SDO, before the first read-back frame: the axis is to stay where it stands."""
         data = np.array([(statusword, position_counts, 0)], codec.READ_BACK).tobytes()
         self._raw = [*self._raw[:index], data, *self._raw[index + 1 :]]
-        self._joined = None
+        self._joined = self._batch = None
         if index in self._slots:
             self._target[self._slots[index]] = position_counts
             # A dead controller may have left the axis under torque: the first controlword must not take it away.

@@ -65,7 +65,8 @@ class DriveGroup:
         self._error: Array = self._plant.following_error_mm()
         self._cached: list[CanFrame] | None = None
         self._pending: dict[int, bytes] = {}
-        self._last_joined = b""
+        self._last_batch: list[CanFrame] | None = None
+        self._last_joined = self._batch_joined = b""
         self._last_words = self._last_modes = b""
         self._relatch = False
         self.remap()
@@ -101,6 +102,10 @@ class DriveGroup:
 
     # frames ------------------------------------------------------------------------------------------------------
     def _on_frames(self, batch: list[CanFrame]) -> None:
+        # A simulated wire passes the sender's own list on: the very same one says what it said before.
+        if batch is self._last_batch:
+            self._sync(self._batch_joined)
+            return
         cobs = self._fast_cobs
         if self._settings.shared_cpu and len(batch) > len(cobs):
             self._waiting = max(0, [frame[0] for frame in batch].count(_SYNC) - 1)
@@ -108,6 +113,7 @@ class DriveGroup:
         if [frame[0] for frame in head] == cobs:
             joined = b"".join([frame[1] for frame in head])
             if len(joined) == len(self._fast_rows) * _RPDO.itemsize:
+                self._last_batch, self._batch_joined = batch if len(batch) == len(cobs) else None, joined
                 self._sync(joined)
                 batch = batch[len(cobs) :]
         for cob, data in batch:
@@ -170,7 +176,7 @@ class DriveGroup:
         self._force_cobs = [0x280 + node.number for node in weighing]
         self._force_index: NDArray[np.intp] = np.array([node.index for node in weighing], dtype=np.intp)
         self._watched = {0x700 + node.host for node in self.nodes if node.host}
-        self._cached, self._relatch, self._last_joined = None, True, b""
+        self._cached, self._relatch, self._last_joined, self._last_batch = None, True, b"", None
 
     # SYNC --------------------------------------------------------------------------------------------------------
     def _sync(self, joined: bytes | None) -> None:
@@ -262,9 +268,7 @@ class DriveGroup:
         """The set-points of those drives that got one since the last SYNC."""
         rows = np.array(list(self._pending), dtype=np.intp)
         image = np.frombuffer(b"".join(self._pending.values()), _RPDO)
-        for index, word, mode in zip(
-            rows.tolist(), image["controlword"].tolist(), image["mode"].tolist(), strict=True
-        ):
+        for index, word, mode in zip(rows.tolist(), image["controlword"].tolist(), image["mode"].tolist(), strict=True):
             self.drives.modes[index] = mode
             self.drives.control(index, word, now_s)
         self.drives.latch(rows, image["target"] / self._counts_per_mm)

@@ -33,7 +33,7 @@ class Heartbeats:
         """A node's own heartbeat was set; 0 stops it."""
         # Nodes with the same interval beat together: one batch on the bus instead of one a node.
         beats = math.floor(self._loop.time() / interval_s) + 1 if interval_s > 0.0 else 0
-        node.next_beat_s = beats * interval_s if beats else None
+        node.beat_s, node.next_beat_s = interval_s, beats * interval_s if beats else None
         self._schedule()
 
     def forget(self, index: int) -> None:

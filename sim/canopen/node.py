@@ -30,15 +30,15 @@ class Node:
 
     def __init__(self, index: int, number: int, settings: DriveSettings, host: Host) -> None:
         self.index, self.number = index, number
-        self.state = INITIALISING
-        self.next_beat_s: float | None = None
         self.host, self.host_timeout_s = 0, 0.0
         self._settings, self._group = settings, host
         self.forget()
 
     def forget(self) -> None:
         """Back to the factory's object dictionary."""
-        self.state, self.next_beat_s = INITIALISING, None
+        self.state = INITIALISING
+        self.beat_s = 0.0
+        self.next_beat_s: float | None = None
         self.dictionary = Dictionary(
             self.number,
             self._settings,
@@ -94,5 +94,5 @@ class Node:
 
     def heartbeat(self, now_s: float) -> CanFrame:
         """The heartbeat due now; sets the next one."""
-        self.next_beat_s = now_s + self.number_of(0x1017) * 1e-3
+        self.next_beat_s = now_s + self.beat_s
         return 0x700 + self.number, bytes((self.state,))

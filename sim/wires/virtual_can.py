@@ -22,6 +22,8 @@ class VirtualCanEnd:
     def __init__(self, bus: VirtualCan) -> None:
         self.on_frames: Callable[[list[CanFrame]], None] = _ignore
         self.on_lost: Callable[[str], None] = _ignore
+        self.timed: list[CanFrame] = []
+        self.wire_s = 0.0
         self._bus = bus
         self.is_open = False
 
@@ -32,7 +34,7 @@ class VirtualCanEnd:
         self.is_open = True
 
     def send(self, frames: list[CanFrame]) -> None:
-        """Put a batch on the bus; it is delivered when its last bit has passed."""
+        """Put a batch on the bus, not to be altered any more; it is delivered when its last bit has passed."""
         if self.is_open:
             self._bus.put(self, frames)
 
@@ -78,9 +80,11 @@ class VirtualCan:
 
     def _start(self, sender: VirtualCanEnd, frames: list[CanFrame]) -> None:
         self._busy = True
-        time_s = wire_time_s(frames, self._bitrate)
-        self.busy_s += time_s
-        self._loop.call_at(self._loop.time() + time_s, self._deliver, sender, frames)
+        if frames is not sender.timed:
+            # While nothing moves, a station sends one and the same batch again and again.
+            sender.timed, sender.wire_s = frames, wire_time_s(frames, self._bitrate)
+        self.busy_s += sender.wire_s
+        self._loop.call_at(self._loop.time() + sender.wire_s, self._deliver, sender, frames)
 
     def _deliver(self, sender: VirtualCanEnd, frames: list[CanFrame]) -> None:
         self._busy = False
