@@ -1,0 +1,219 @@
+"""The loop between events and effects: what reaches the motion side when, and what ends a run."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from docking.cell import Cell
+from docking.errors import DriveFault, TargetLost
+from docking.state import Effect, Event, State
+from sim.virtual_time import run_virtual
+
+ANSWERS = {
+    Effect.CONNECT: Event.CONNECTED,
+    Effect.ENABLE: Event.ENABLED,
+    Effect.LOCATE: Event.FRAME_MEASURED,
+    Effect.MEASURE: Event.MEASURED,
+    Effect.FIT: Event.FITTED,
+    Effect.PLAN: Event.PLANNED,
+    Effect.ASK: Event.CONFIRMED,
+    Effect.MOVE: Event.MOVED,
+    Effect.SETTLE: Event.SETTLED,
+}
+
+
+class Everything:
+    """Procedure, motion, journal and operator in one: it answers each effect after a second and keeps what it is told.
+
+    `answers` replaces the answer of an effect by an event, an error to raise, or a coroutine function.
+    """
+
+    def __init__(self, moves: int = 2, **answers) -> None:
+        self.motion = self.journal = self.operator = self
+        self.moves = moves
+        self.said: list[str] = []
+        self.records: list[tuple[str, dict]] = []
+        self.requests: list[tuple[float, str]] = []
+        self.alarms: list[Exception] = []
+        self.closed = 0
+        self.began: list[Effect] = []
+        self._answers = ANSWERS | {Effect[name]: answer for name, answer in answers.items()}
+        self.effects = {effect: self._effect(effect) for effect in Effect}
+
+    def _effect(self, effect: Effect):
+        async def perform() -> Event:
+            self.began.append(effect)
+            if effect is Effect.JUDGE:
+                self.moves -= 1
+                return Event.MOVE_NEEDED if self.moves >= 0 else Event.ACCEPTED
+            await asyncio.sleep(1.0)
+            answer = self._answers[effect]
+            if isinstance(answer, Exception):
+                raise answer
+            return await answer() if callable(answer) else answer
+
+        return perform
+
+    def write(self, kind: str, body: dict, *, durable: bool = False) -> None:
+        self.records.append((kind, body))
+
+    def notify(self, key: str, **facts: object) -> None:
+        self.said.append(" ".join([key, *map(str, facts.values())]))
+
+    def request(self, verb: str) -> None:
+        self.requests.append((asyncio.get_running_loop().time(), verb))
+
+    def alarm(self, error: Exception) -> None:
+        self.alarms.append(error)
+
+    async def close(self) -> None:
+        self.closed += 1
+
+    def states(self) -> list[str]:
+        return [body["to"] for kind, body in self.records if kind == "state"]
+
+
+def dock(parts: Everything, *posts: tuple[float, Event]) -> State:
+    """Dock with events posted at their times."""
+
+    async def main() -> State:
+        cell = Cell(parts)
+        for at_s, event in posts:
+            asyncio.get_running_loop().call_later(at_s, cell.post, event)
+        state = await asyncio.wait_for(cell.dock(), 1000.0)
+        assert asyncio.all_tasks() == {asyncio.current_task()}
+        return state
+
+    return run_virtual(main)
+
+
+MOVE_AT_S = 7.0
+"""When the first move begins: seven effects of a second before it."""
+
+
+def test_a_docking_runs_through_the_table_and_closes():
+    parts = Everything(moves=2)
+    assert dock(parts) is State.DOCKED
+    assert parts.closed == 1
+    assert parts.began.count(Effect.MOVE) == 2
+    assert parts.states()[:6] == ["standby", "standby", "disabled", "disabled", "idle", "measure-frame"]
+    assert parts.states()[-3:] == ["fit", "verify", "docked"]
+
+
+@pytest.mark.parametrize("late_s", [1e-6, 0.5, 0.999])
+def test_a_hold_reaches_the_motion_side_during_the_move(late_s):
+    parts = Everything()
+    assert dock(parts, (MOVE_AT_S + late_s, Event.HOLD)) is State.DOCKED
+    assert parts.requests == [(pytest.approx(MOVE_AT_S + late_s), "hold")]
+    assert ("command", {"verb": "hold"}) in parts.records
+
+
+def test_a_hold_directly_behind_the_confirmation_is_not_lost():
+    async def confirm_and_hold() -> Event:
+        cells[0].post(Event.CONFIRMED)
+        cells[0].post(Event.HOLD)
+        await asyncio.sleep(0.0)
+        raise asyncio.CancelledError
+
+    cells: list[Cell] = []
+    parts = Everything(moves=1, ASK=confirm_and_hold)
+
+    async def main() -> State:
+        cells.append(Cell(parts))
+        return await cells[0].dock()
+
+    assert run_virtual(main) is State.DOCKED
+    assert [verb for _, verb in parts.requests] == ["hold"]
+
+
+def test_a_hold_after_the_end_of_a_move_is_not_kept_for_the_next():
+    async def moved_then_held() -> Event:
+        asyncio.get_running_loop().call_soon(cells[0].post, Event.HOLD)
+        cells[0].post(Event.HOLD)
+        return Event.MOVED
+
+    cells: list[Cell] = []
+    parts = Everything(moves=2, MOVE=moved_then_held)
+
+    async def main() -> State:
+        cells.append(Cell(parts))
+        return await cells[0].dock()
+
+    assert run_virtual(main) is State.DOCKED
+    assert parts.requests == []
+
+
+@pytest.mark.parametrize("event", [Event.HOLD, Event.RESUME, Event.RESET])
+def test_what_the_table_refuses_is_told_and_changes_nothing(event):
+    parts = Everything()
+    assert dock(parts, (5.5, event)) is State.DOCKED
+    assert parts.requests == []
+    assert any(event.value in text and "possible here" in text for text in parts.said)
+
+
+@pytest.mark.parametrize("at_s", [3.5, 4.5, 5.5, 6.5, 8.5])
+def test_an_abort_at_rest_ends_the_run_at_once(at_s):
+    parts = Everything()
+    assert dock(parts, (at_s, Event.ABORT)) is State.RECOVER
+    assert parts.closed == 1
+    assert parts.requests == []
+    assert parts.states()[-1] == "recover"
+
+
+def test_an_abort_during_a_move_waits_for_the_motion_to_stop():
+    async def stopping() -> Event:
+        await asyncio.sleep(3.0)
+        return Event.STOPPED
+
+    parts = Everything(MOVE=stopping)
+    assert dock(parts, (MOVE_AT_S + 0.5, Event.ABORT)) is State.RECOVER
+    assert [verb for _, verb in parts.requests] == ["stop"]
+    assert parts.states()[-2:] == ["stopping", "recover"]
+    assert Effect.SETTLE not in parts.began
+
+
+@pytest.mark.parametrize("effect", ["CONNECT", "ENABLE", "MEASURE", "FIT", "PLAN", "ASK", "MOVE", "SETTLE"])
+def test_an_error_ends_the_run_as_a_fault_with_its_alarm(effect):
+    error = TargetLost("J07") if effect == "MEASURE" else DriveFault("B.Y", "overcurrent", value=1)
+    parts = Everything(**{effect: error})
+    assert dock(parts) is State.FAULT
+    assert parts.alarms == [error]
+    assert parts.closed == 1
+
+
+def test_the_cause_of_a_fault_is_kept():
+    parts = Everything(MOVE=DriveFault("B.Y", "overcurrent", value=1))
+
+    async def main() -> str | None:
+        cell = Cell(parts)
+        await cell.dock()
+        return cell.situation.cause
+
+    cause = run_virtual(main)
+    assert cause is not None
+    assert "B.Y" in cause
+
+
+@pytest.mark.parametrize("effect", ["MEASURE", "MOVE"])
+def test_a_defect_closes_the_devices_and_is_raised(effect):
+    parts = Everything(**{effect: ZeroDivisionError("a defect")})
+    with pytest.raises(ZeroDivisionError):
+        dock(parts)
+    assert parts.closed == 1
+    assert parts.states()[-1] == "fault"
+
+
+def test_a_cancelled_run_closes_the_devices():
+    parts = Everything()
+
+    async def main() -> None:
+        task = asyncio.get_running_loop().create_task(Cell(parts).dock())
+        await asyncio.sleep(MOVE_AT_S + 0.5)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    run_virtual(main)
+    assert parts.closed == 1
