@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2, norm
 
 from docking.errors import SigmaMissing, TooFewPoints
 from docking.pose import FitSettings, fit_pose, screen
 from docking.pose.passes import mean_reading
+from docking.pose.quantiles import chi2_upper, normal_tail
 from docking.pose.uncertainty import largest_sigma_mm
 from docking.types import Array, Fit, Points, Pose, Screened
 
@@ -71,7 +71,7 @@ def reference_shift(X_WT: Pose, reference: Points, readings: Points, sigmas: flo
     cov = world.cov_mm2[now] + reference.cov_mm2[before]
     if not bool(np.all(np.isfinite(cov))):
         raise SigmaMissing("reference points", value="a reading")
-    return _verdict(tuple(world.names[i] for i in now), shift, cov, 2.0 * float(norm.sf(sigmas)))
+    return _verdict(tuple(world.names[i] for i in now), shift, cov, 2.0 * normal_tail(sigmas))
 
 
 def _averaged(readings: Points) -> Points:
@@ -87,8 +87,8 @@ def _verdict(names: tuple[str, ...], shift: Array, cov: Array, probability: floa
     weight = np.linalg.inv(cov)
     mean_cov = np.linalg.inv(weight.sum(axis=0))
     mean = mean_cov @ np.einsum("nij,nj->i", weight, shift)
-    together = float(mean @ np.linalg.solve(mean_cov, mean)) / float(chi2.isf(probability, 3))
-    single = np.einsum("ni,nij,nj->n", shift, weight, shift) / float(chi2.isf(probability / len(names), 3))
+    together = float(mean @ np.linalg.solve(mean_cov, mean)) / chi2_upper(probability, 3)
+    single = np.einsum("ni,nij,nj->n", shift, weight, shift) / chi2_upper(probability / len(names), 3)
     worst = int(np.argmax(single))
     ratio, size = (together, mean) if together >= single[worst] else (float(single[worst]), shift[worst])
     value = float(np.linalg.norm(size))

@@ -10,13 +10,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
 
 from docking.errors import CheckPointDisagrees, SigmaMissing
+from docking.pose.quantiles import chi2_upper
 from docking.pose.svd import fit_svd
 from docking.pose.uncertainty import largest_sigma_mm
 from docking.types import Array, FeatureErrors, Fit, Points, Pose
-
 
 _RISK_DRAWS = 8192
 """A risk at its limit of 2.5 % is known to 0.17 %."""
@@ -154,7 +153,7 @@ def check_points_agree(fit: Fit, nominal: Points, measured: Points, false_alarm:
     if not bool(np.all(np.isfinite(cov))):
         raise SigmaMissing("check point", value="a check point")
     statistic = np.einsum("ni,ni->n", off, np.linalg.solve(cov, off[:, :, None])[:, :, 0])
-    quantile = float(chi2.isf(false_alarm / max(len(off), 1), 3))
+    quantile = chi2_upper(false_alarm / max(len(off), 1), 3)
     size = np.linalg.norm(off, axis=1)
     limit = size * np.sqrt(quantile / np.maximum(statistic, np.finfo(float).tiny))
     for i in np.argsort(-statistic):

@@ -6,9 +6,9 @@ from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
 
 from docking.errors import UnitMixUp
+from docking.pose.quantiles import normal_upper
 from docking.pose.settings import FitSettings
 from docking.types import Array
 
@@ -52,7 +52,7 @@ def pair_tolerance_mm(
     n = len(nominal_mm)
     d = distances(nominal_mm)
     variance = _distance_variance(nominal_mm, covs_mm2[0]) + _distance_variance(measured_mm, covs_mm2[1])
-    sigmas = float(norm.isf(settings.false_alarm / max(n * (n - 1), 2)))
+    sigmas = normal_upper(settings.false_alarm / max(n * (n - 1), 2))
     result: Array = sigmas * np.sqrt(variance + (settings.expansion_sigma * d) ** 2)
     return result
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 from math import sqrt
 
 import numpy as np
-from scipy.stats import chi2
 
 from docking.errors import StationMoved
 from docking.pose.pairs import distances, estimated_sigma_mm
+from docking.pose.quantiles import chi2_upper
 from docking.pose.settings import FitSettings
 from docking.types import Array, Points, Rejection
 
@@ -122,7 +122,7 @@ def average_passes(points: Points, settings: FitSettings) -> Averaged:
     tables = _pass_tables(points, usable, numbers)
     scatter = _scatter_mm(tables, max((len(r) for r in usable.values()), default=1))
     pairs = sum(len(r) * (len(r) - 1) // 2 for r in usable.values())
-    quantile = float(chi2.isf(settings.false_alarm / max(pairs, 1), 3))
+    quantile = chi2_upper(settings.false_alarm / max(pairs, 1), 3)
     for name, rows in usable.items():
         _settle(result, name, _Readings(points, rows, [numbers[i] for i in rows]), (scatter, quantile))
     disagreeing = sum(r.reason == "passes-disagree" for r in result.rejected)

@@ -11,10 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
-from scipy.stats import f as fisher
 
 from docking.pose.least_squares import Solution, design, fit_maximum_likelihood
+from docking.pose.quantiles import chi2_upper, fisher_upper
 from docking.pose.svd import fit_svd
 from docking.pose.uncertainty import total_cov_mm2
 from docking.types import Array
@@ -89,7 +88,7 @@ def _ratio(pairs: Pairs, kept: list[int], statistics: Array, alpha: float, scale
     """Statistic over threshold (n,); above 1 a point does not belong."""
     n = len(statistics)
     if not scaled:
-        return statistics / float(chi2.isf(alpha / n, 3))
+        return statistics / chi2_upper(alpha / n, 3)
     inside = np.zeros(n, dtype=bool)
     inside[kept] = True
     total = float(np.sum(_weighted_squares(pairs, kept)))
@@ -97,7 +96,7 @@ def _ratio(pairs: Pairs, kept: list[int], statistics: Array, alpha: float, scale
     dof = np.where(inside, max(dof_all - 3, 1), max(dof_all, 1)).astype(np.float64)
     # By the rank-one identity the other points' sum of squares is the total minus the statistic of the point tested.
     others = np.where(inside, np.maximum(total - statistics, 1e-9 * max(total, 1e-30)), total) / dof
-    threshold = fisher.isf(alpha / n, 3, dof)
+    threshold = fisher_upper(alpha / n, 3, dof)
     result: Array = statistics / 3.0 / np.maximum(others, 1e-300) / threshold
     return result
 
