@@ -14,6 +14,9 @@ OPENING = {State.STANDBY: Event.CONNECT, State.DISABLED: Event.ENABLE, State.IDL
 REQUESTS = {Effect.HOLD: "hold", Effect.RESUME: "resume", Effect.STOP: "stop"}
 """Effects that only tell the running move something."""
 
+TOLD = {Effect.HOLD: "paused", Effect.RESUME: "resumed", Effect.STOP: "stopping"}
+"""What the operator hears of them."""
+
 
 class Cell:
     """A docking cell. `dock()` runs one docking to one of the final states; `post()` takes the operator's events."""
@@ -54,7 +57,7 @@ class Cell:
         try:
             self.situation, effects = step(self.situation, event, error.text() if error else None)
         except EventRefused as refusal:
-            self.procedure.operator.notify(refusal.text())
+            self.procedure.operator.notify("refused_event", error=refusal)
             return
         body = {"from": before.value, "event": event.value, "to": self.situation.state.value}
         self.procedure.journal.write("state", body)
@@ -70,6 +73,7 @@ class Cell:
             self._activity.add_done_callback(self._ended)
             return
         self.procedure.journal.write("command", {"verb": verb})
+        self.procedure.operator.notify(TOLD[effect])
         # A move that has just ended takes no more requests: one kept for later would hold or stop the next move.
         if self._activity is not None and not self._activity.done():
             self.procedure.motion.request(verb)

@@ -21,6 +21,7 @@ from docking.errors import (
     DockingError,
     StoppedByOperator,
 )
+from docking.words import tell
 
 EXIT_OF_OUTCOME = {
     "docked": EXIT_OK,
@@ -226,39 +227,12 @@ def _ended(summary: dict[str, Any], as_json: bool) -> int:
 
 
 def _summary_text(summary: dict[str, Any]) -> str:
-    words = {"en": _ENGLISH, "zh": _CHINESE}[language()]
-    lines = [words[summary["outcome"]]]
+    lines = [tell(language(), summary["outcome"])]
     if summary["max_feature_error_mm"] is not None:
-        lines.append(words["features"].format(**summary))
+        lines.append(tell(language(), "features", **summary))
     if summary["true_max_feature_error_mm"] is not None:
-        lines.append(words["truth"].format(**summary))
-    if summary["virtual_time_s"] is not None:
-        lines.append(words["moves"].format(**summary))
-    lines += [f"{a['code']}: {a['message']}\n    -> {a['remedy']}" for a in summary["alarms"]]
-    return "\n".join(lines)
-
-
-_ENGLISH = {
-    "docked": "DOCKED: every docking feature is inside its tolerance with its uncertainty.",
-    "out_of_tolerance": "OUT OF TOLERANCE: at least one docking feature cannot be proved inside its tolerance.",
-    "stopped": "STOPPED by the operator. Measure again before moving on.",
-    "fault": "FAULT: motion stopped.",
-    "refused": "REFUSED: nothing was started.",
-    "features": "largest feature deviation {max_feature_error_mm:.3f} mm, sigma {feature_sigma_mm:.3f} mm, "
-    "tolerance {tolerance_mm:.3f} mm",
-    "truth": "true largest deviation (simulation only) {true_max_feature_error_mm:.3f} mm",
-    "moves": "{moves} moves in {virtual_time_s:.0f} s of cell time, computed in {wall_time_s:.1f} s",
-}
-_CHINESE = {
-    "docked": "对接完成:所有对接特征连同不确定度均在公差内。",
-    "out_of_tolerance": "超差:至少一个对接特征无法证明在公差内。",
-    "stopped": "操作者停止。继续前重新测量。",
-    "fault": "故障:运动已停止。",
-    "refused": "已拒绝:未启动任何运动。",
-    "features": "最大特征偏差 {max_feature_error_mm:.3f} mm,σ {feature_sigma_mm:.3f} mm,公差 {tolerance_mm:.3f} mm",
-    "truth": "真实最大偏差(仅仿真){true_max_feature_error_mm:.3f} mm",
-    "moves": "{moves} 次运动,单元时间 {virtual_time_s:.0f} s,计算用时 {wall_time_s:.1f} s",
-}
+        lines.append(tell(language(), "truth", **summary))
+    return "\n".join([*lines, tell(language(), "moves", **summary)])
 
 
 def _error_json(error: DockingError) -> dict[str, Any]:

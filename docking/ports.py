@@ -6,7 +6,7 @@ Drivers implement these; `docking.assemble` binds them. Every method may raise a
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from docking.state import Event
 from docking.types import Array, Feedback, Identity, MoveResult, Plan, Reading
@@ -130,17 +130,35 @@ class Operator(Protocol):
         """Begin: `post` takes the operator's hold, resume and abort at any time."""
         ...
 
-    async def confirm(self, plan: Plan, shown: dict[str, Any]) -> bool:
-        """Show the deviation and every axis displacement; True = go, False = abort."""
+    def show(self, plan: Plan, shown: dict[str, Any]) -> None:
+        """Show the deviation that was measured and the displacement of every axis that is planned."""
         ...
 
     async def permissives(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """Ask for the named inputs; return those that are not given."""
         ...
 
-    def notify(self, text: str) -> None:
-        """Say what is happening."""
+    async def confirm(self, plan: Plan, shown: dict[str, Any]) -> bool:
+        """True = go, False = abort."""
         ...
+
+    def notify(self, key: str, **facts: Any) -> None:
+        """Say what is happening: a text of `docking.words` with its facts."""
+        ...
+
+
+T = TypeVar("T")
+
+
+class Aside(Protocol):
+    """Works out what takes long while the ticks go on."""
+
+    async def __call__(self, work: Callable[[], T]) -> T: ...
+
+
+async def at_once(work: Callable[[], T]) -> T:
+    """The `Aside` of virtual time, which stands still while work is done."""
+    return work()
 
 
 ByteSink = Callable[[bytes], None]

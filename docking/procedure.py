@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -113,7 +113,7 @@ class Procedure:
         alarm = error.alarm(self._survey.clock())
         self.progress.alarms.append(alarm)
         self.journal.write("alarm", records.alarm_record(alarm))
-        self.operator.notify(f"{alarm.code}: {error.text()}")
+        self.operator.notify("alarm", code=alarm.code, error=error)
 
     async def close(self) -> None:
         """Release the devices; what goes wrong is told, and the rest is still released."""
@@ -127,7 +127,7 @@ class Procedure:
         found = (await self._survey.tracker.connect(), *await self.motion.connect())
         for identity in found:
             self.journal.write("identity", vars(identity))
-        self.operator.notify(f"{len(found)} devices answer")
+        self.operator.notify("devices", count=len(found))
         return Event.CONNECTED
 
     async def _enable(self) -> Event:
@@ -135,9 +135,10 @@ class Procedure:
         return Event.ENABLED
 
     async def _locate(self) -> Event:
+        self.operator.notify("measuring_references")
         await self._survey.locate(self._settings.X_WT, self._settings.X_WM)
         station = _known(self._survey.X_WT, "station")
-        self.operator.notify(f"station located from {len(station.names)} references, rms {station.rms_mm:.3f} mm")
+        self.operator.notify("located", count=len(station.names), rms_mm=station.rms_mm)
         return Event.FRAME_MEASURED
 
     async def _measure(self) -> Event:
@@ -145,22 +146,28 @@ class Procedure:
         more = p.passes > 0
         passes = self._survey.settings.passes
         guess = pose_from_axes(self._settings.positioners, self._commanded())
+        self.operator.notify("measuring_component", passes=passes)
         await self._survey.measure_component(guess, self._settings.X_WM, passes, more=more)
         p.passes = passes if not more else p.passes + passes
         return Event.MEASURED
 
     async def _fit(self) -> Event:
         p, survey, settings = self.progress, self._survey, self._survey.settings.component_fit
+        measured = _known(survey.component, "component")
         try:
-            fit = fit_pose(screen(survey.nominals.targets, _known(survey.component, "component"), settings), settings)
+            fit = await self._survey.aside(
+                lambda: fit_pose(screen(survey.nominals.targets, measured, settings), settings)
+            )
         except (NotCongruent, AmbiguousSet) as refusal:
             # With a third reading of every point the screening can tell a bad reading from a bad point.
             if p.passes >= 2 * survey.settings.passes:
                 raise
-            self.operator.notify(refusal.text())
+            self.operator.notify("again", error=refusal)
             return Event.MEASURE_MORE
         self.journal.write("fit", records.fit_record(fit, "component", self._station().name))
         p.rejected |= {r.name for r in fit.rejected}
+        if fit.rejected:
+            self.operator.notify("left_out", names=", ".join(f"{r.name} ({r.reason})" for r in fit.rejected))
         if not (fit.max_mm <= self._settings.target_residual_mm):
             worst = fit.names[int(np.argmax(np.linalg.norm(fit.residuals_mm, axis=1)))]
             raise FitResidual(worst, value=fit.max_mm, limit=self._settings.target_residual_mm)
@@ -195,8 +202,12 @@ class Procedure:
         self.journal.write("features", records.features_record(errors, station.name, when))
         i = errors.worst()
         self.operator.notify(
-            f"{station.name}: {errors.names[i]} is off by {errors.norm_mm[i]:.3f} mm "
-            f"(sigma {errors.sigma_mm[i]:.3f}, tolerance {errors.tolerance_mm[i]:.3f})"
+            "off",
+            stage=station.name,
+            feature=errors.names[i],
+            error_mm=float(errors.norm_mm[i]),
+            sigma_mm=float(errors.sigma_mm[i]),
+            tolerance_mm=float(errors.tolerance_mm[i]),
         )
         if not self._check_points_agree(fit):
             return Event.MEASURE_MORE
@@ -251,7 +262,7 @@ class Procedure:
         self._survey.leave_out(error.where)
         self.progress.rejected.add(error.where)
         self.journal.write("set_aside", {"name": error.where, "error_mm": error.value, "limit_mm": error.limit})
-        self.operator.notify(error.text())
+        self.operator.notify("set_aside", error=error)
 
     async def _plan(self) -> Event:
         p, station = self.progress, self._station()
@@ -266,19 +277,26 @@ class Procedure:
             period_s=self._settings.period_s,
             linear_interpolation=self._settings.linear_interpolation,
         )
-        p.plan = make_plan(request, self._settings.positioners, self._settings.plan)
+        p.plan = await self._survey.aside(lambda: make_plan(request, self._settings.positioners, self._settings.plan))
         self.journal.write("plan", records.plan_record(p.plan))
         return Event.PLANNED
 
     async def _ask(self) -> Event:
-        p, plan = self.progress, self._planned()
+        plan, shown = self._planned(), self._shown()
+        self.operator.show(plan, shown)
         missing = await self.operator.permissives(self._station().permissives)
         if missing:
             raise PermissiveMissing(missing[0], value=self._station().name)
-        shown = records.features_record(p.errors, plan.stage, "before") if p.errors else {}
         go = await self.operator.confirm(plan, shown)
         self.journal.write("confirm", {"plan_hash": plan.plan_hash, "go": go})
         return Event.CONFIRMED if go else Event.DECLINED
+
+    def _shown(self) -> dict[str, Any]:
+        """The features' deviation from the goal of the planned move, and which axes only follow."""
+        station, driven = self._station(), self._settings.positioners.driven
+        errors = self._approach.errors(self._component_fit(), self._mate_fit(), station, self._drift_sigma_mm())
+        passive = [axis for axis, on in zip(self.motion.axes, driven, strict=True) if not on]
+        return {**records.features_record(errors, station.name, "before"), "passive": passive}
 
     async def _move(self) -> Event:
         p, plan = self.progress, self._planned()
@@ -288,9 +306,8 @@ class Procedure:
         self._check_start(plan)
         self.journal.write("intent", records.intent_record(plan), durable=True)
         await self.motion.load(plan)
-        self.operator.notify(
-            f"moving: {plan.kind} {plan.stage}, {plan.duration_s:.0f} s, limited by {plan.speed_limited_by}"
-        )
+        facts = {"kind": plan.kind, "stage": plan.stage, "limited_by": plan.speed_limited_by}
+        self.operator.notify("moving", duration_s=plan.duration_s, **facts)
         result = await self.motion.start(plan.plan_hash)
         p.moves, p.passes = p.moves + 1, 0
         p.commanded_mm = result.commanded_mm
@@ -311,6 +328,8 @@ class Procedure:
     async def _settle(self) -> Event:
         rest_s = await settle(self.motion, self._settings.settle)
         self.journal.write("settled", {"t_s": rest_s})
+        p = self.progress
+        self.operator.notify("moved", residual_mm=p.max_residual_mm, force_n=p.max_internal_force_n)
         return Event.SETTLED
 
     # what is known ---------------------------------------------------------------------------------------------

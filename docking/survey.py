@@ -13,7 +13,7 @@ import numpy as np
 
 from docking.calibration.station import ReferenceShift, locate_station, reference_shift, to_world
 from docking.errors import DeviceSilent, StationMoved, TargetLost, TwoFaceDisagrees
-from docking.ports import Journal, Tracker
+from docking.ports import Aside, Journal, Tracker, at_once
 from docking.pose import FitSettings, fit_pose, screen
 from docking.pose.passes import average_passes
 from docking.records import fit_record, station_record
@@ -46,13 +46,14 @@ class Nominals:
 
 @dataclass
 class Survey:
-    """The tracker's work in one docking. `X_WT` and `X_WM` hold the newest fits."""
+    """The tracker's work in one docking. `X_WT` and `X_WM` hold the newest fits; fits are worked out `aside`."""
 
     tracker: Tracker
     journal: Journal
     nominals: Nominals
     settings: SurveySettings
     clock: Callable[[], float]
+    aside: Aside = at_once
     X_WT: Fit | None = None
     X_WM: Fit | None = None
     checked_at_s: float = float("nan")
@@ -79,11 +80,12 @@ class Survey:
         guess = self.X_WT.X_MN if self.X_WT is not None else X_WT_guess
         await self._check_faces(guess)
         ers = await self._shoot("ers", self.nominals.ers, guess, Pose.identity(), self.settings.passes)
-        self.X_WT = locate_station(self.nominals.ers, ers, self.settings.station_fit)
+        self.X_WT = await self.aside(lambda: locate_station(self.nominals.ers, ers, self.settings.station_fit))
         self.journal.write("station", station_record(self.X_WT))
         X_WM = self.X_WM.X_MN if self.X_WM is not None else X_WM_guess
         mate = await self._measure_W("mate", self.nominals.mate, X_WM, self.settings.passes)
-        self.X_WM = fit_pose(screen(self.nominals.mate, mate, self.settings.mate_fit), self.settings.mate_fit)
+        fit = self.settings.mate_fit
+        self.X_WM = await self.aside(lambda: fit_pose(screen(self.nominals.mate, mate, fit), fit))
         self.journal.write("fit", fit_record(self.X_WM, "mate", "frame"))
         self._keep_references(ers, mate)
         self.checked_at_s = self.clock()

@@ -26,7 +26,7 @@ from docking.kinematics import Positioners
 from docking.motion import QueuedMotion, StreamedMotion
 from docking.motion.monitors import Watch, WatchLimits
 from docking.motion.settle import SettleSettings
-from docking.ports import CanLink, Journal, Motion, Operator, SerialLink, Tracker
+from docking.ports import Aside, CanLink, Journal, Motion, Operator, SerialLink, Tracker, at_once
 from docking.pose import Features, FitSettings
 from docking.procedure import Procedure, ProcedureSettings
 from docking.survey import Nominals, Survey, SurveySettings
@@ -51,11 +51,12 @@ class Wires:
 
 @dataclass(frozen=True)
 class Company:
-    """Who a run works with: the journal, the operator, and the clock of the loop."""
+    """Who a run works with: the journal, the operator, the clock of the loop, who works out what takes long."""
 
     journal: Journal
     operator: Operator
     clock: Callable[[], float]
+    aside: Aside = at_once
 
 
 def build_cell(cell: CellFile, job: JobFile, wires: Wires, company: Company) -> Cell:
@@ -68,6 +69,7 @@ def build_cell(cell: CellFile, job: JobFile, wires: Wires, company: Company) -> 
         nominals=_nominals(cell, job),
         settings=_survey_settings(cell, job),
         clock=company.clock,
+        aside=company.aside,
     )
     settings = _procedure_settings(cell, job, positioners)
     approach = _approach(cell, job)

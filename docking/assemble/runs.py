@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from docking.assemble.controller import Company, Wires, build_cell
+from docking.assemble.real_time import aside, on_interrupt, run_real
 from docking.assemble.simulated import FarEnd, make_far_end, real_wires, truth_of, virtual_wires
 from docking.cell import Cell
 from docking.config import CellFile, JobFile
@@ -20,11 +21,12 @@ from docking.config.load import default_job_path, file_sha256, load_cell, load_j
 from docking.errors import BadArgument, FileUnreadable
 from docking.journal import JournalFile, read
 from docking.operators import AutomaticOperator, TerminalOperator
-from docking.ports import Operator
+from docking.ports import Operator, at_once
 from docking.procedure import Progress
 from docking.records import alarm_record
-from docking.state import State
+from docking.state import Event, State
 from docking.version import VERSION
+from docking.words import tell
 from drivers.links.can_bus import CanBusLink
 from drivers.links.serial_port import SerialPort
 from sim.truth import TruthFile
@@ -36,7 +38,10 @@ OUTCOMES = {
     State.RECOVER: "stopped",
     State.FAULT: "fault",
 }
-DECISION_RULE = "e + 2 sigma <= tolerance for every docking feature (ISO 14253-1, k = 2)"
+DECISION_RULE = (
+    "e + 2 sigma <= tolerance for every docking feature (ISO 14253-1, k = 2), "
+    "and at most 2.5 % risk that any feature is out of tolerance (JCGM 106)"
+)
 Say = Callable[[str], None]
 
 
@@ -91,8 +96,8 @@ def dry_run_files(files: Files, truth: TruthFile, request: RunRequest, say: Say)
         async def main() -> dict[str, Any]:
             far = make_far_end(files.cell, files.job, truth, request.seed)
             wires = await virtual_wires(files.cell, far)
-            operator = AutomaticOperator(say)
-            return await _dock(_Run(files, request, wires, operator, path, far, simulated=True))
+            operator = AutomaticOperator(say, request.language)
+            return await _dock(_Run(files, request, wires, operator, path, far, simulated=True, real=False))
 
         summary = run_virtual(main)
         return _finish(request, path, summary)
@@ -112,7 +117,7 @@ def run_on_wires(request: RunRequest, choice: WireChoice, say: Say, *, step: boo
                 found = await real_wires(files.cell, far, folder)
             else:
                 found = _read_wires(choice.wires, files.cell) if choice.wires else {}
-            operator = TerminalOperator(say, request.language) if step else AutomaticOperator(say)
+            operator = (TerminalOperator if step else AutomaticOperator)(say, request.language)
             wires = near_ends(files.cell, found)
             try:
                 return await _dock(_Run(files, request, wires, operator, path, far, simulated=choice.sim))
@@ -120,7 +125,7 @@ def run_on_wires(request: RunRequest, choice: WireChoice, say: Say, *, step: boo
                 if far is not None:
                     await far.close()
 
-        return _finish(request, path, asyncio.run(main()))
+        return _finish(request, path, run_real(main))
 
 
 def serve(request: RunRequest, wires_file: Path | None, say: Say) -> None:
@@ -131,6 +136,8 @@ def serve(request: RunRequest, wires_file: Path | None, say: Say) -> None:
         async def main() -> None:
             far = make_far_end(files.cell, files.job, truth_of(request.cell_path), request.seed)
             found = await real_wires(files.cell, far, Path(folder))
+            asked_to_end = asyncio.Event()
+            on_interrupt(asked_to_end.set)
             text = json.dumps(found, indent=2)
             if wires_file is not None:
                 # Written whole and then renamed: a reader never meets half a file.
@@ -138,13 +145,13 @@ def serve(request: RunRequest, wires_file: Path | None, say: Say) -> None:
                 part.write_text(text + "\n", "utf-8")
                 part.replace(wires_file)
             say(text)
-            say("simulated devices are served; end with Ctrl-C")
+            say(tell(request.language, "served"))
             try:
-                await asyncio.Event().wait()
+                await asked_to_end.wait()
             finally:
                 await far.close()
 
-        asyncio.run(main())
+        run_real(main)
 
 
 def near_ends(cell: CellFile, found: dict[str, Any]) -> Wires:
@@ -167,6 +174,7 @@ class _Run:
     journal_path: Path
     far: FarEnd | None
     simulated: bool
+    real: bool = True
 
 
 async def _dock(run: _Run) -> dict[str, Any]:
@@ -176,8 +184,11 @@ async def _dock(run: _Run) -> dict[str, Any]:
     journal = JournalFile(run.journal_path, loop.time)
     try:
         journal.write("run_started", _started(run), durable=True)
-        cell = build_cell(run.files.cell, run.files.job, run.wires, Company(journal, run.operator, loop.time))
+        company = Company(journal, run.operator, loop.time, aside if run.real else at_once)
+        cell = build_cell(run.files.cell, run.files.job, run.wires, company)
         run.operator.attend(cell.post)
+        if run.real:
+            on_interrupt(lambda: _abort(cell, run.operator))
         state = await cell.dock()
         times = (loop.time() - started_s, time.perf_counter() - wall_s)
         summary = _summary(run, cell, state, times)
@@ -185,6 +196,11 @@ async def _dock(run: _Run) -> dict[str, Any]:
         return summary
     finally:
         journal.close()
+
+
+def _abort(cell: Cell, operator: Operator) -> None:
+    operator.notify("interrupted")
+    cell.post(Event.ABORT)
 
 
 def _started(run: _Run) -> dict[str, Any]:

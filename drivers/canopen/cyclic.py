@@ -56,6 +56,7 @@ class CyclicImage:
         self._index = {cob: index for index, cob in enumerate(self._cobs)}
         self._force_index = {self._map.pdos["force"].cob + n.node: n.index for n in self.nodes if n.load_cell}
         self._raw: list[bytes] = [bytes(codec.READ_BACK.itemsize)] * count
+        self._gathered: dict[int, bytes] = {}
         self._joined: bytes | None = None
         self._batch: list[CanFrame] | None = None
         self._decoded = b""
@@ -164,6 +165,25 @@ class CyclicImage:
             self._force[index] = int.from_bytes(data, "little", signed=True) * self._map.newton_per_count
             return True
         return False
+
+    def _gather(self, index: int, data: bytes) -> None:
+        """Keep a read-back until those of the same SYNC are here, or the next SYNC's begin.
+
+        Positions of different instants would make a moving figure look strained.
+        """
+        if index in self._gathered:
+            self._pass_on()
+        self._gathered[index] = data
+        if len(self._gathered) == len(self._cobs):
+            self._pass_on()
+
+    def _pass_on(self) -> None:
+        raw = list(self._raw)
+        for index, data in self._gathered.items():
+            raw[index] = data
+            self._seen[index] = self.cycles
+        self._raw, self._joined = raw, None
+        self._gathered.clear()
 
     def seed(self, index: int, statusword: int, position_counts: int) -> None:
         """Start from values read by SDO, before the first read-back frame: the axis is to stay where it stands."""

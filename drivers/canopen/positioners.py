@@ -44,11 +44,10 @@ class CanopenPositioners:
         self._power = PowerGroup(self._image, self._step, self._cause_of)
         self._setups = tuple(NodeBringUp(node, self._map, link.send) for node in self._nodes)
         self._heartbeat = codec.heartbeat(self._map.host_node)
-        self._heartbeat_cycles = max(1, round(self._bus.heartbeat_s / self.cycle_s))
         self._loop: asyncio.AbstractEventLoop
         self._handlers = self._routes()
         self._keeper: asyncio.TimerHandle | None = None
-        self._keeper_due_s = self._sync_s = 0.0
+        self._keeper_due_s = self._sync_s = self._beat_due_s = 0.0
         self._lost: str | None = None
         self._open = self._live = self._first = self._sequencing = self._stopping = False
 
@@ -212,7 +211,9 @@ class CanopenPositioners:
             self._image.aim_at_read_back()
         now_s = self._loop.time()
         frames = self._image.frames()
-        if self._image.cycles % self._heartbeat_cycles == 0:
+        # By time, not by cycles: ticks that come late must not stretch what the drives' watchdogs live on.
+        if self._image.cycles == 0 or now_s >= self._beat_due_s:
+            self._beat_due_s = now_s + self._bus.heartbeat_s - 0.5 * self.cycle_s
             frames = [*frames, self._heartbeat]
             self._watch.check(now_s)
         self._image.cycles += 1
