@@ -258,7 +258,7 @@ JOB_CASES = {
     "part too heavy": (put("component.mass_kg", 400.0), ["component.mass_kg", "C.Z", "rated_n is 500"]),
     "tolerance not provable": (
         put("component.features.1.tolerance_mm", 0.01),
-        ["component.features[1].tolerance_mm", "0.01 mm", "lower-right", "2 sigma = 0.0274", "largest part"],
+        ["component.features[1].tolerance_mm", "0.01 mm", "lower-right", "2 sigma = 0.0275", "largest part"],
     ),
     "nan": (put("component.com_mm.2", math.nan), ["component.com_mm[2] = NaN", "finite"]),
     "unknown key": (put("component.massa_kg", 60.0), ["component.massa_kg = 60", "nearest valid key: mass_kg"]),
