@@ -17,7 +17,7 @@ from docking.errors import (
     WarpTrip,
 )
 from docking.kinematics import CouplingMonitor, Positioners, coupling_monitor, socket_positions
-from docking.types import Array, Feedback
+from docking.types import Array, Feedback, Plan
 
 
 @dataclass(frozen=True)
@@ -62,6 +62,13 @@ class Watch:
         """Linearise the coupling check about the socket figure at `q_mm` (m,)."""
         self._coupling = coupling_monitor(self._positioners, socket_positions(self._positioners, q_mm), self._up)
 
+    def quick_slew_per_s(self, plan: Plan) -> float:
+        """How fast a fault may turn the rate of `plan` down: with the path's own acceleration, inside the quick-stop
+        deceleration of every axis. Every cycle that a jammed axis is left behind strains the part."""
+        peak = np.abs(np.diff(plan.q_mm, axis=0)).max(axis=0) / plan.period_s
+        spare = (self._positioners.a_quick_mm_s2 - self._positioners.a_mm_s2) / np.maximum(peak, 1e-9)
+        return max(plan.rate_slew_per_s, float(np.min(spare[self.driven])))
+
     def evaluate(self, feedback: Feedback, q_ref_mm: Array, speed_mm_s: Array | float) -> MotionError | None:
         """The first violated limit, or None. `q_ref_mm` (m,) is the rigid figure the read-back belongs to."""
         if feedback.fault is not None:
@@ -71,11 +78,22 @@ class Watch:
         if not (worst_age <= self._limits.missing_cycles):
             axis = self._axes[int(np.argmax(feedback.age_cycles))]
             return FeedbackMissing(axis, value=float(worst_age), limit=self._limits.missing_cycles)
+        if worst_age > 0.0:
+            return self._judge_late(feedback, speed_mm_s)
         return (
             self._following(feedback.following_error_mm, speed_mm_s)
             or self._figure(feedback.position_mm, q_ref_mm)
             or self._ball_forces(feedback.force_n)
         )
+
+    def _judge_late(self, feedback: Feedback, speed_mm_s: Array | float) -> MotionError | None:
+        """Judge without the figure: a late read-back beside fresh ones would look like a squeezed part."""
+        trip = self._following(feedback.following_error_mm, speed_mm_s) or self._ball_forces(feedback.force_n)
+        if trip is None:
+            return None
+        axis = self._axes[int(np.argmax(feedback.age_cycles))]
+        cause = f"{axis} has not reported for {feedback.age_cycles.max():.0f} cycles."
+        return type(trip)(trip.where, cause, value=trip.value, limit=trip.limit)
 
     def _following(self, error_mm: Array, speed_mm_s: Array | float) -> MotionError | None:
         magnitude = np.abs(error_mm)
@@ -90,18 +108,24 @@ class Watch:
     def _figure(self, position_mm: Array, q_ref_mm: Array) -> MotionError | None:
         if self._coupling is None:
             return None
-        residual, force, warp = self._coupling.evaluate(position_mm - q_ref_mm)
+        off_mm = position_mm - q_ref_mm
+        residual, force, warp = self._coupling.evaluate(off_mm)
         self.residual_mm, self.internal_force_n, self.warp_n = residual, force, warp
         self.max_residual_mm = max(self.max_residual_mm, residual)
         self.max_internal_force_n = max(self.max_internal_force_n, force)
         limits = self._limits
         if not (residual <= limits.ball_residual_mm):
-            return ConsistencyTrip("ball centres", value=residual, limit=limits.ball_residual_mm)
+            return ConsistencyTrip("ball centres", self._worst(off_mm), value=residual, limit=limits.ball_residual_mm)
         if not (force <= limits.internal_force_n):
-            return InternalForceTrip("ball centres", value=force, limit=limits.internal_force_n)
+            return InternalForceTrip("ball centres", self._worst(off_mm), value=force, limit=limits.internal_force_n)
         if not (abs(warp) <= limits.warp_force_n):
-            return WarpTrip("Z axes", value=warp, limit=limits.warp_force_n)
+            return WarpTrip("Z axes", self._worst(off_mm), value=warp, limit=limits.warp_force_n)
         return None
+
+    def _worst(self, off_mm: Array) -> str:
+        """The axis that is farthest from its place on the path."""
+        k = int(np.argmax(np.abs(off_mm)))
+        return f"{self._axes[k]} is {off_mm[k]:+.3f} mm from its place."
 
     def _ball_forces(self, force_n: Array) -> MotionError | None:
         over = np.abs(force_n) > self._rated_n

@@ -28,10 +28,10 @@ class Playback:
         self._last = len(plan.q_mm) - 1
         self._period = plan.period_s
 
-    def turn_to(self, rate: float) -> None:
-        """Begin to bring the rate to `rate` (0 hold or stop, 1 run)."""
+    def turn_to(self, rate: float, slew_per_s: float | None = None) -> None:
+        """Begin to bring the rate to `rate` (0 hold or stop, 1 run); a fault may ask for another slew."""
         self._from, self._to, self._since = self.rate, rate, 0.0
-        self._span = 1.5 * abs(rate - self.rate) / self.plan.rate_slew_per_s
+        self._span = 1.5 * abs(rate - self.rate) / (slew_per_s or self.plan.rate_slew_per_s)
 
     def wait(self) -> None:
         """Stand where it is until the rate is turned up."""

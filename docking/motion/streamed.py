@@ -47,6 +47,7 @@ class StreamedMotion:
         self._move: _Move | None = None
         self._cause: DockingError | None = None
         self._early: list[str] = []
+        self._left_alone = False
         self._timer: asyncio.Handle | None = None
         self._deadline_s = 0.0
         self._judged: Feedback | None = None
@@ -63,6 +64,7 @@ class StreamedMotion:
         self._history.extend([self._setpoint] * 3)
         self._feedback, self._judged, self._loaded, self._cause = feedback, None, None, None
         self._early.clear()
+        self._left_alone = False
         self._watch.watch_about(self._setpoint)
         loop = asyncio.get_running_loop()
         self._deadline_s = loop.time()
@@ -117,7 +119,8 @@ class StreamedMotion:
                 move.playback.turn_to(1.0)
             return
         move.stop_asked = move.stop_asked or verb == "stop"
-        move.playback.turn_to(0.0)
+        if self._cause is None:
+            move.playback.turn_to(0.0)
 
     def feedback(self) -> Feedback:
         if self._cause is not None:
@@ -163,7 +166,7 @@ class StreamedMotion:
         feedback = self._bus.exchange(self._setpoint)
         self._feedback = feedback
         cause = self._judge(feedback, move) or self._lateness(now - self._deadline_s)
-        if cause is not None and self._cause is None:
+        if cause is not None:
             self._trip(cause, move)
         if move is not None:
             self._follow(move, feedback)
@@ -194,11 +197,15 @@ class StreamedMotion:
         return TickLate("motion", value=late_s, limit=limit) if not (late_s <= limit) else None
 
     def _trip(self, cause: DockingError, move: _Move | None) -> None:
-        self._cause = cause
-        if isinstance(cause, DriveFault | FeedbackMissing):
+        """Keep the first cause and stop on the path; axes that cannot be led there stop by themselves, now or later."""
+        if isinstance(cause, DriveFault | FeedbackMissing) and not self._left_alone:
+            self._left_alone = True
             self._bus.quick_stop()
+        if self._cause is not None:
+            return
+        self._cause = cause
         if move is not None:
-            move.playback.turn_to(0.0)
+            move.playback.turn_to(0.0, self._watch.quick_slew_per_s(move.playback.plan))
 
     def _follow(self, move: _Move, feedback: Feedback) -> None:
         playback = move.playback

@@ -18,7 +18,7 @@ from docking.errors import (
 )
 from tests.reference_geometry import AXES, rc1
 from tests.support.motion_fakes import LIMITS, read_back, watch_of
-from tests.support.planned_moves import lab_site
+from tests.support.planned_moves import a_plan, lab_site
 from tests.support.rigid_figure import sockets_mm
 
 Q = np.zeros(12)
@@ -215,3 +215,41 @@ def test_maxima_are_kept_until_the_next_move():
     watch.reset_maxima()
     assert (watch.max_residual_mm, watch.max_internal_force_n) == (0.0, 0.0)
     np.testing.assert_array_equal(watch.max_following_mm, 0.0)
+
+
+@pytest.mark.parametrize("row", [0, 7, 11])
+def test_a_coupling_trip_names_the_axis_that_is_out_of_its_place(row):
+    out = np.zeros(12)
+    out[row] = -0.5
+    trip = rc1_watch().evaluate(read_back(out), Q, 0.0)
+    assert AXES[row] in trip.text()
+    assert "-0.500 mm" in trip.text()
+
+
+def test_a_late_read_back_is_no_squeezed_part_but_is_told_with_what_else_trips():
+    watch = rc1_watch()
+    moved = np.full(12, 0.3)
+    moved[4] = 0.0
+    age = np.zeros(12)
+    age[4] = 2.0
+    assert isinstance(watch.evaluate(read_back(moved), Q, 0.0), ConsistencyTrip)
+    assert watch.evaluate(read_back(moved, age_cycles=age), Q, 0.0) is None
+    force = np.full(12, 0.0)
+    force[1] = 20000.0
+    trip = watch.evaluate(read_back(moved, age_cycles=age, force_n=force), Q, 0.0)
+    assert isinstance(trip, BallForceTrip)
+    assert trip.where == "A.Y"
+    assert "B.Y has not reported for 2 cycles" in trip.text()
+
+
+def test_a_fault_may_stop_a_plan_as_hard_as_the_axes_can():
+    plan = a_plan(lab_site(), 3)
+    positioners = lab_site().positioners
+    slew = watch_of(positioners).quick_slew_per_s(plan)
+    peak = np.abs(np.diff(plan.q_mm, axis=0)).max(axis=0) / plan.period_s
+    worst = (peak * slew + positioners.a_mm_s2) / positioners.a_quick_mm_s2
+    assert worst.max() == pytest.approx(1.0)
+    assert slew > 5.0 * plan.rate_slew_per_s
+    # Axes that can do no better than their path acceleration stop as a hold does.
+    weak = replace(positioners, a_quick_mm_s2=positioners.a_mm_s2)
+    assert watch_of(weak).quick_slew_per_s(plan) == plan.rate_slew_per_s

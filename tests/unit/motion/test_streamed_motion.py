@@ -200,6 +200,39 @@ def test_a_trip_stops_all_axes_on_the_path():
     on_bench(scenario)
 
 
+def test_a_trip_stops_as_hard_as_the_axes_can_and_no_harder():
+    async def scenario(bench):
+        move = await bench.begin()
+        errors = np.zeros(12)
+        errors[4] = 2.0
+        trip_s = 0.5 * PLAN.duration_s
+        after(trip_s, bench.bus.changes.__setitem__, "following_error_mm", errors)
+        # Nobody's hold makes the stop of a fault a softer one.
+        after(trip_s + 0.025, bench.motion.request, "hold")
+        begun = asyncio.get_running_loop().time()
+        await move
+        assert asyncio.get_running_loop().time() - begun - trip_s <= 0.09
+        bend = np.abs(np.diff(np.array(bench.bus.sent), 2, axis=0)) / 1e-4
+        assert (bend.max(axis=0) <= POSITIONERS.a_quick_mm_s2 * 1.001).all()
+        assert bend.max() > 2.0 * POSITIONERS.a_mm_s2.max()
+
+    on_bench(scenario)
+
+
+def test_a_drive_that_faults_while_a_trip_is_led_to_rest_makes_all_stop_by_themselves():
+    async def scenario(bench):
+        move = await bench.begin()
+        errors = np.zeros(12)
+        errors[4] = 2.0
+        after(1.0, bench.bus.changes.__setitem__, "following_error_mm", errors)
+        after(1.02, bench.bus.changes.__setitem__, "fault", ("B.Y", 0x8611, "following error"))
+        assert_faulted(await move, FollowingErrorTrip, "B.Y")
+        await asyncio.sleep(0.5)
+        assert bench.bus.quick_stops == 1
+
+    on_bench(scenario)
+
+
 def test_a_coupling_trip_stops_all_axes_on_the_path():
     async def scenario(bench):
         move = await bench.begin()
