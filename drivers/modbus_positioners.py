@@ -246,9 +246,9 @@ class ModbusPositioners:
         return np.array([axis[0] for plc in self._plcs for axis in plc.status.axes]) / per_mm
 
     def _feedback(self) -> Feedback:
-        words = np.array([axis[:3] for plc in self._plcs for axis in plc.status.axes], dtype=np.float64)
-        raw = words.T * self._units
-        raw[2, words[:, 2] == self._map.scale["no_force"]] = np.nan
+        words = np.array([axis for plc in self._plcs for axis in plc.status.axes], dtype=np.float64).T
+        raw = words[:3] * self._units
+        raw[2, words[2] == self._map.scale["no_force"]] = np.nan
         times = [plc.path_time_s() for plc in self._plcs]
         self.path_spread_s = max(times) - min(times)
         return Feedback(
@@ -257,7 +257,7 @@ class ModbusPositioners:
             following_error_mm=raw[1],
             force_n=raw[2],
             states=self._states(),
-            age_cycles=np.array([float(watch.misses) for watch in self._watches for _ in range(3)]),
+            age_cycles=np.repeat([float(watch.misses) for watch in self._watches], 3),
             path_time_s=min(times),
             fault=next((fault for plc in self._plcs if (fault := self._fault(plc)) is not None), None),
         )

@@ -150,15 +150,15 @@ class PositionerPlc:
             min(int(queue.fraction * reg.FRACTION), reg.FRACTION - 1), queue.free, self._segment_result, flags,
             self._station,
         )  # fmt: skip
-        return head + b"".join(
-            reg.STATUS_AXIS.pack(*row, self._axis_bits(i)) for i, row in enumerate(self._sensors.words())
-        )
+        rows = zip(self._sensors.words(), self._axis_bits(), strict=True)
+        return head + b"".join([reg.STATUS_AXIS.pack(*row, bits) for row, bits in rows])
 
-    def _axis_bits(self, i: int) -> int:
-        fault = reg.AXIS_FAULT * (i == self._fault_axis)
-        if i not in self._gate.driven:
-            return reg.AXIS_PASSIVE | fault
-        return reg.AXIS_POWERED * self.powered | reg.AXIS_BRAKED * self.braked | fault
+    def _axis_bits(self) -> list[int]:
+        live = reg.AXIS_POWERED * self.powered | reg.AXIS_BRAKED * self.braked
+        bits = [live if i in self._gate.driven else reg.AXIS_PASSIVE for i in range(reg.AXES)]
+        if self._fault_axis >= 0:
+            bits[self._fault_axis] |= reg.AXIS_FAULT
+        return bits
 
     # scan ----------------------------------------------------------------------------------------------------------
     @property
@@ -192,7 +192,7 @@ class PositionerPlc:
             self.braked = self.braked or now_s - self._since_s >= STANDSTILL_S
             if now_s - self._since_s >= STANDSTILL_S + BRAKE_S:
                 self._enter(State.FAULT if self.fault else State.DISABLED, now_s)
-        else:
+        elif state is not State.ENABLED:
             self._supervise(now_s)
 
     def play(self, line_high: bool, now_s: float, dt_s: float) -> None:

@@ -60,17 +60,22 @@ class Readings:
         """(position um, following error um, force 10 N) of every axis."""
         if self._words_scan != self._scan:
             self._words_scan = self._scan
-            position = map(round, (self._plant.encoder_mm() * 1000.0).tolist())
-            error = (max(-32767, min(32767, round(e))) for e in (self._plant.following_error_mm() * 1000.0).tolist())
+            position = np.rint(self._plant.encoder_mm() * 1000.0).astype(np.int64).tolist()
+            error = _whole(self._plant.following_error_mm() * 1000.0).astype(np.int64).tolist()
             self._rows = list(zip(position, error, self._forces(), strict=True))
         return self._rows
 
     def _forces(self) -> list[int]:
         if self._measured and self._scan - self._force_scan >= FORCE_EVERY:
             self._force_scan = self._scan
-            tens = np.rint(np.clip(self._plant.force_n() / 10.0, -32767, 32767))
+            tens = _whole(self._plant.force_n() / 10.0)
             self._force = np.where(self._has_force, tens, NO_FORCE).astype(np.int64).tolist()
         return self._force
+
+
+def _whole(values: Array) -> Array:
+    """Whole numbers that fit a signed register (np.clip costs five times as much on small arrays)."""
+    return np.rint(np.maximum(np.minimum(values, 32767.0), -32767.0))
 
 
 class Sensors:
