@@ -202,6 +202,10 @@ class UnitMixUp(PoseError):
     code = 3011
 
 
+class FeatureDisagrees(PoseError):
+    code = 3013
+
+
 class SigmaMissing(PoseError):
     code = 3012
 

@@ -14,9 +14,9 @@ import numpy as np
 
 from docking import records
 from docking.approach import Approach, Station
+from docking.cross_check import CrossCheck
 from docking.errors import (
     AmbiguousSet,
-    CheckPointDisagrees,
     DockingError,
     FitResidual,
     FrameImplausible,
@@ -28,16 +28,13 @@ from docking.kinematics import Positioners, ball_reactions_n, figure_residual_mm
 from docking.motion.settle import SettleSettings, settle
 from docking.planning import Action, Attempt, GuardSettings, PlanRequest, PlanSettings, check_correction, make_plan
 from docking.ports import Journal, Motion, Operator
-from docking.pose import check_points_agree, fit_pose, screen
+from docking.pose import fit_pose, screen
 from docking.state import Effect, Event
 from docking.survey import Survey
 from docking.types import Alarm, Array, FeatureErrors, Fit, Plan, Pose
 
 START_TOLERANCE_MM = 0.05
 """How far an axis may stand from where its plan begins."""
-
-FEWEST_CHECK_POINTS = 2
-"""Check points that must remain and agree when one is set aside."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +92,7 @@ class Procedure:
         self._settings, self._approach, self._survey = settings, approach, survey
         self.motion, self.journal, self.operator = motion, journal, operator
         self.progress = Progress()
+        self._cross_check = CrossCheck(survey, journal, settings.target_residual_mm, self._set_aside)
         self.effects: dict[Effect, Callable[[], Awaitable[Event]]] = {
             Effect.CONNECT: self._connect,
             Effect.ENABLE: self._enable,
@@ -209,9 +207,13 @@ class Procedure:
             sigma_mm=float(errors.sigma_mm[i]),
             tolerance_mm=float(errors.tolerance_mm[i]),
         )
-        if not self._check_points_agree(fit):
-            return Event.MEASURE_MORE
-        return self._decide(station)
+        last = p.passes >= self._approach.convergence.max_passes
+        agree = self._cross_check.check_points(fit, last=last) and self._cross_check.features(fit, mate, last=last)
+        return self._decide(station) if agree else Event.MEASURE_MORE
+
+    def _set_aside(self, error: DockingError) -> None:
+        self.progress.rejected.add(error.where)
+        self.operator.notify("set_aside", error=error)
 
     def _decide(self, station: Station) -> Event:
         p, verdict = self.progress, self._approach.verdict(self.progress.history, station)
@@ -233,36 +235,6 @@ class Procedure:
             return Event.MOVE_NEEDED
         self.journal.write("features", records.features_record(_known(p.errors, "errors"), station.name, "final"))
         return Event.ACCEPTED
-
-    def _check_points_agree(self, fit: Fit) -> bool:
-        """Points kept out of the fit must lie where the fit says; they see what the fit's own residuals cannot.
-
-        False asks for more passes: measuring moves nothing, and one bad reading must not end a docking. A single point
-        that is grossly off while two or more agree is a reflector that does not sit, named and set aside.
-        Raises CheckPointDisagrees when the passes are spent.
-        """
-        nominal, seen = self._survey.check_points()
-        if not len(seen):
-            return True
-        try:
-            off_mm, limit_mm = check_points_agree(fit, nominal, seen)
-        except CheckPointDisagrees as error:
-            gross = isinstance(error.value, float) and error.value > self._settings.target_residual_mm
-            if gross and len(seen) > FEWEST_CHECK_POINTS:
-                self._set_aside(error)
-                return self._check_points_agree(fit)
-            if self.progress.passes < self._approach.convergence.max_passes:
-                return False
-            raise
-        body = {"error_mm": np.linalg.norm(off_mm, axis=1).tolist(), "limit_mm": limit_mm.tolist()}
-        self.journal.write("check_points", {"names": list(seen.names), **body})
-        return True
-
-    def _set_aside(self, error: CheckPointDisagrees) -> None:
-        self._survey.leave_out(error.where)
-        self.progress.rejected.add(error.where)
-        self.journal.write("set_aside", {"name": error.where, "error_mm": error.value, "limit_mm": error.limit})
-        self.operator.notify("set_aside", error=error)
 
     async def _plan(self) -> Event:
         p, station = self.progress, self._station()

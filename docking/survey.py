@@ -36,12 +36,14 @@ class SurveySettings:
 
 @dataclass(frozen=True)
 class Nominals:
-    """Nominal points: ERS in W, mate targets in M, component targets and check points in C."""
+    """Nominal points: ERS in W, mate targets in M, component targets and check points in C, features in both."""
 
     ers: Points
     mate: Points
     targets: Points
     checks: Points
+    features: Points
+    mate_features: Points
 
 
 @dataclass
@@ -59,6 +61,8 @@ class Survey:
     checked_at_s: float = float("nan")
     component: Points | None = None
     checks: Points | None = None
+    features: tuple[Points, Points] | None = None
+    features_confirmed: bool = False
     _references: dict[str, Points] = field(default_factory=dict)
 
     async def locate(self, X_WT_guess: Pose, X_WM_guess: Pose) -> None:
@@ -99,11 +103,13 @@ class Survey:
             try:
                 targets = await self._measure_W("component", self.nominals.targets, X_WC_guess, passes)
                 checks = await self._measure_W("check", self.nominals.checks, X_WC_guess, passes)
+                features = await self._measure_features(X_WC_guess, passes)
                 targets = _joined(self.component, targets) if more and self.component else targets
                 average_passes(targets, self.settings.component_fit)
                 await self._check_references()
                 self.checks = _joined(self.checks, checks) if more and self.checks else checks
                 self.component = targets
+                self._keep_features(features, more)
                 return
             except StationMoved as moved:
                 self._note_moved(moved)
@@ -111,6 +117,32 @@ class Survey:
                     raise
             more = False
             await self.locate(self._station(), X_WM_guess)
+
+    async def _measure_features(self, X_WC_guess: Pose, passes: int) -> tuple[Points, Points]:
+        """Features of the component and of the mate, twice as often as targets: once confirmed, never again."""
+        X_WM = self.X_WM.X_MN if self.X_WM is not None else Pose.identity()
+        often = 0 if self.features_confirmed else 2 * passes
+        part = await self._measure_W("feature", self.nominals.features, X_WC_guess, often)
+        return part, await self._measure_W("mate-feature", self.nominals.mate_features, X_WM, often)
+
+    def _keep_features(self, features: tuple[Points, Points], more: bool) -> None:
+        if self.features_confirmed:
+            return
+        if more and self.features is not None:
+            features = _joined(self.features[0], features[0]), _joined(self.features[1], features[1])
+        self.features = features
+
+    def seen_features(self) -> tuple[tuple[Points, Points], tuple[Points, Points]]:
+        """(nominal, measured in W) features of the component and of the mate, passes averaged."""
+        nominals = self.nominals.features, self.nominals.mate_features
+        fits = self.settings.component_fit, self.settings.mate_fit
+        seen = self.features if self.features is not None else (_picked(nominals[0], []), _picked(nominals[1], []))
+        averaged = [_averaged(points, fit) for points, fit in zip(seen, fits, strict=True)]
+        part, mate = (
+            (_picked(nominal, [nominal.names.index(n) for n in points.names]), points)
+            for nominal, points in zip(nominals, averaged, strict=True)
+        )
+        return part, mate
 
     def _note_moved(self, moved: StationMoved) -> None:
         body = {"reference": moved.where, "shift_mm": moved.value, "limit_mm": moved.limit, "restationed": True}

@@ -54,7 +54,7 @@ class Plant:
         self._bank = AxisBank(axis_truth, sockets, self._carries)
         _check_strokes(self.axes, self._bank.motor_mm, axis_truth.stroke_mm)
         self._load_cells = LoadCells(cell, truth, draws)
-        self._place_ers(cell, draws)
+        self._place_ers(cell, job, draws)
         ppm = truth.clock_ppm.ppm * draws.uniform("clock_ppm", (len(cell.positioners),))
         self.clock_ppm: dict[str, float] = {p.name: float(v) for p, v in zip(cell.positioners, ppm, strict=True)}
         self._resolution_mm = truth.drives.encoder_um * 1e-3
@@ -113,7 +113,7 @@ class Plant:
         return self._load_cells.read_n(self._equilibrium.force_n, elapsed)
 
     def target_names(self) -> tuple[str, ...]:
-        """All reflectors: ERS points, mate targets, component targets, check points."""
+        """All reflectors: ERS points, mate and component targets, check points, measured features (NAME.C, NAME.M)."""
         return self._names
 
     def target_W_mm(self, name: str, t_s: float) -> Array:
@@ -127,9 +127,15 @@ class Plant:
         self._refresh(elapsed)
         component_k, mate_k = self._temperatures.excess_k(elapsed)
         body = self._equilibrium.body
-        part = self._component.targets_mm(component_k, body.rotation.T @ self._down, self._support_change())
-        mate = self._mate_pose.at(elapsed).apply(self._mate.targets_mm(mate_k))
-        return np.vstack((self._ers, mate, body.place(part)))
+        down, change = body.rotation.T @ self._down, self._support_change()
+        part = self._component.targets_mm(component_k, down, change)
+        features = self._component.features_mm(component_k, down, change)[self._seen_features]
+        X_WM = self._mate_pose.at(elapsed)
+        mate, mate_features = self._mate.targets_mm(mate_k), self._mate.features_mm(mate_k)[self._seen_features]
+        on_mate = X_WM.apply(np.vstack((mate, mate_features)))
+        return np.vstack(
+            (self._ers, on_mate[: len(mate)], body.place(np.vstack((part, features))), on_mate[len(mate) :])
+        )
 
     def true_feature_errors_mm(self) -> Array:
         """True distances (f,) between the component's features and the mate's, now."""
@@ -231,12 +237,15 @@ class Plant:
         upward = -self._supports.rows[index] @ self._down * self._equilibrium.force_n[index]
         return bool(upward > 0.0)
 
-    def _place_ers(self, cell: CellFile, draws: Draws) -> None:
+    def _place_ers(self, cell: CellFile, job: JobFile, draws: Draws) -> None:
         """True ERS points: the file's, each off by a draw of its own stated sigma; then the table of all reflectors."""
         nominal = np.array([e.xyz_mm for e in cell.tracker.ers])
         sigma = np.array([e.sigma_mm for e in cell.tracker.ers])
+        self._seen_features = [i for i, f in enumerate(job.component.features) if f.measured]
         self._ers: Array = nominal + sigma[:, None] * draws.normal("ers_points", nominal.shape)
+        features = [job.component.features[i].name for i in self._seen_features]
         names = tuple(e.name for e in cell.tracker.ers) + self._mate.target_names + self._component.target_names
+        names += tuple(f"{name}.C" for name in features) + tuple(f"{name}.M" for name in features)
         self._row = {name: i for i, name in enumerate(names)}
         if len(self._row) != len(names):
             repeated = sorted({n for n in names if names.count(n) > 1})

@@ -20,7 +20,7 @@ from docking.config.build import (
     positioners_from,
 )
 from docking.config.cell import ModbusBus
-from docking.config.nominal import ers_points, feature_points, mate_feature_points, target_points
+from docking.config.nominal import ers_points, feature_points, mate_feature_points, measured_features, target_points
 from docking.geometry import pose_from_vector
 from docking.kinematics import Positioners
 from docking.motion import QueuedMotion, StreamedMotion
@@ -109,11 +109,14 @@ def _motion(cell: CellFile, positioners: Positioners, wires: Wires) -> Motion:
 
 def _nominals(cell: CellFile, job: JobFile) -> Nominals:
     part, mate = job.component, job.mate
+    features, mate_features = measured_features(job, cell)
     return Nominals(
         ers=ers_points(cell.tracker.ers),
         mate=target_points(mate.targets, mate, cell),
         targets=target_points(part.targets, part, cell),
         checks=target_points(part.check_points, part, cell),
+        features=features,
+        mate_features=mate_features,
     )
 
 

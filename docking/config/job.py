@@ -36,6 +36,11 @@ class Feature(Model):
     sigma_mm: Positive = Field(description="of the feature to the component's targets, 1 sigma a coordinate, mm")
     mate_sigma_mm: Positive = Field(description="of its mate point to the mate's targets, 1 sigma a coordinate, mm")
     tolerance_mm: Positive = Field(description="largest distance of the two points, mm")
+    measured: bool = Field(
+        default=False,
+        description="a reflector sits on both sides of the feature at the first station: it is measured there and must "
+        "agree with the stated coordinates",
+    )
 
 
 class Component(Model):

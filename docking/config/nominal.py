@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from docking.config.cell import CellFile, ErsPoint
-from docking.config.job import Component, Mate, Target
+from docking.config.job import Component, JobFile, Mate, Target
 from docking.types import Array, Points
 
 
@@ -43,3 +43,17 @@ def mate_feature_points(component: Component, mate: Mate, cell: CellFile) -> Poi
 def ers_points(ers: tuple[ErsPoint, ...]) -> Points:
     """Reference points (n, 3) in W."""
     return Points(tuple(p.name for p in ers), np.array([p.xyz_mm for p in ers]), _isotropic([p.sigma_mm for p in ers]))
+
+
+def measured_features(job: JobFile, cell: CellFile) -> tuple[Points, Points]:
+    """The docking features that are measured at the first station: on the component (C) and on the mate (M).
+
+    The tracker knows them as NAME.C and NAME.M.
+    """
+    rows = [i for i, f in enumerate(job.component.features) if f.measured]
+    sides = (
+        (feature_points(job.component, cell), ".C"),
+        (mate_feature_points(job.component, job.mate, cell), ".M"),
+    )
+    part, mate = (Points(tuple(p.names[i] + side for i in rows), p.xyz_mm[rows], p.cov_mm2[rows]) for p, side in sides)
+    return part, mate

@@ -142,22 +142,36 @@ class CheckPoints(NamedTuple):
 def check_points_agree(fit: Fit, nominal: Points, measured: Points, false_alarm: float = 0.001) -> CheckPoints:
     """Compare the points kept out of the fit with where it puts them.
 
-    `nominal` in the body's frame and `measured` in the fit's M, same names in the same order. The test is chi-square
-    with 3 degrees of freedom on fit, reading and nominal covariance. Raises CheckPointDisagrees naming the worst,
-    SigmaMissing where a covariance is not known.
+    `nominal` in the body's frame and `measured` in the fit's M, same names in the same order. Two chi-square tests on
+    fit, reading and nominal covariance: each point (3 degrees of freedom), and all together with the fit's error common
+    to them. Raises CheckPointDisagrees naming the worst, SigmaMissing where a covariance is not known.
     """
     predicted = fit.predict(nominal.xyz_mm)
     off = measured.xyz_mm - predicted
-    R = fit.X_MN.R
-    cov = fit.point_cov_mm2(predicted) + measured.cov_mm2 + R @ nominal.cov_mm2 @ R.T
-    if not bool(np.all(np.isfinite(cov))):
+    R, count = fit.X_MN.R, len(off)
+    jac = fit.point_jacobian(predicted).reshape(-1, 7)
+    joint = jac @ fit.whole_cov() @ jac.T
+    for i, own in enumerate(measured.cov_mm2 + R @ nominal.cov_mm2 @ R.T):
+        joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += own
+    if not bool(np.all(np.isfinite(joint))):
         raise SigmaMissing("check point", value="a check point")
+    cov = np.array([joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(count)])
     statistic = np.einsum("ni,ni->n", off, np.linalg.solve(cov, off[:, :, None])[:, :, 0])
-    quantile = chi2_upper(false_alarm / max(len(off), 1), 3)
     size = np.linalg.norm(off, axis=1)
+    quantile = chi2_upper(false_alarm / max(count, 1), 3)
     limit = size * np.sqrt(quantile / np.maximum(statistic, np.finfo(float).tiny))
-    for i in np.argsort(-statistic):
-        if not (statistic[i] <= quantile):
-            known = float(limit[i]) if np.isfinite(limit[i]) else None
-            raise CheckPointDisagrees(measured.names[i], value=float(size[i]), limit=known)
+    worst = int(np.argmax(np.where(np.isnan(statistic), np.inf, statistic)))
+    if not (statistic[worst] <= quantile):
+        raise _disagrees(measured.names[worst], float(size[worst]), float(limit[worst]), "")
+    together = float(off.reshape(-1) @ np.linalg.solve(joint, off.reshape(-1)))
+    allowed = chi2_upper(false_alarm, 3 * count)
+    if not (together <= allowed):
+        shrink = float(np.sqrt(allowed / together))
+        cause = f"Each one might be, all {count} together are not."
+        raise _disagrees(measured.names[worst], float(size[worst]), float(size[worst]) * shrink, cause)
     return CheckPoints(off, limit)
+
+
+def _disagrees(name: str, size_mm: float, limit_mm: float, cause: str) -> CheckPointDisagrees:
+    known = limit_mm if np.isfinite(limit_mm) else None
+    return CheckPointDisagrees(name, cause, value=size_mm, limit=known)
