@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -40,9 +42,22 @@ def test_five_times_one_error_is_never_docked_falsely(error: str, code: int | No
         assert code in [alarm["code"] for alarm in summary["alarms"]]
 
 
-def test_a_base_turned_by_half_a_degree_stops_on_force() -> None:
+def run_with_turned_bases(plausibility_mm: float) -> dict[str, Any]:
     request = RunRequest(FUSELAGE, None, 1, None, None, "en")
+    files = load_files(request)
+    limits = files.cell.limits.model_copy(update={"frame_plausibility_mm": plausibility_mm})
+    files = replace(files, cell=files.cell.model_copy(update={"limits": limits}))
     truth = truth_of(FUSELAGE).scaled({"uncalibrated_base": 1.0})
-    summary = dry_run_files(load_files(request), truth, request, lambda text: None)
+    return dry_run_files(files, truth, request, lambda text: None)
+
+
+def test_bases_turned_by_half_a_degree_are_refused_before_anything_moves() -> None:
+    summary = run_with_turned_bases(plausibility_mm=0.5)
+    assert (summary["outcome"], summary["moves"]) == ("refused", 0)
+    assert summary["alarms"][0]["code"] == 5007
+
+
+def test_bases_turned_by_half_a_degree_stop_on_force_where_the_first_check_is_blinded() -> None:
+    summary = run_with_turned_bases(plausibility_mm=10.0)
     assert summary["outcome"] == "fault"
-    assert summary["alarms"][0]["code"] == 2111
+    assert summary["alarms"][0]["code"] in (2103, 2111)
