@@ -162,7 +162,7 @@ def test_an_abort_stops_on_the_path_for_good(name, number, share, tmp_path):
     if result["result"] == "stopped":
         assert 0.0 <= result["path_time_s"] < plan.duration_s
         gone = np.abs(run.rest_mm - plan.q_mm[0]).max()
-        assert gone < np.abs(plan.displacement_mm).max()
+        assert gone <= np.abs(plan.displacement_mm).max() + 0.002
     else:
         assert share > 0.5
 
