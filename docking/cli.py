@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import sys
+import tempfile
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +21,7 @@ from docking.errors import (
     EXIT_STOPPED,
     BadArgument,
     ConfigInvalid,
+    Defect,
     DockingError,
     StoppedByOperator,
 )
@@ -31,6 +35,8 @@ EXIT_OF_OUTCOME = {
     "refused": EXIT_FAULT,
 }
 FILE = click.Path(path_type=Path)
+SEED = click.IntRange(min=0)
+COUNT = click.IntRange(min=1)
 
 
 def language() -> str:
@@ -84,7 +90,7 @@ def check(cell: Path, job: Path | None, as_json: bool) -> int:
 @cli.command("dry-run")
 @click.argument("cell", type=FILE)
 @click.argument("job", type=FILE, required=False)
-@click.option("--seed", default=1, show_default=True, help="Seed of the simulated errors.")
+@click.option("--seed", type=SEED, default=1, show_default=True, help="Seed of the simulated errors.")
 @click.option("--report", type=FILE, help="Write the report to this HTML file.")
 @click.option(
     "--journal", type=FILE, help="Keep the journal in this file (default: beside the report, else temporary)."
@@ -109,7 +115,7 @@ def dry_run(cell: Path, job: Path | None, seed: int, report: Path | None, journa
 @click.option("--sim", is_flag=True, help="Use simulated devices on real wires.")
 @click.option("--wires", type=FILE, help="Addresses that `docking sim` wrote; without it --sim starts its own devices.")
 @click.option("--step", is_flag=True, help="Ask before every move; h holds, r resumes, a aborts.")
-@click.option("--seed", default=1, show_default=True, help="Seed of the simulated errors (with --sim).")
+@click.option("--seed", type=SEED, default=1, show_default=True, help="Seed of the simulated errors (with --sim).")
 @click.option("--report", type=FILE, help="Write the report to this HTML file.")
 @click.option(
     "--journal", type=FILE, help="Keep the journal in this file (default: beside the report, else temporary)."
@@ -137,7 +143,7 @@ def run(as_json: bool, step: bool, sim: bool, wires: Path | None, **request: Any
 @cli.command()
 @click.argument("cell", type=FILE)
 @click.argument("job", type=FILE, required=False)
-@click.option("--seed", default=1, show_default=True, help="Seed of the simulated errors.")
+@click.option("--seed", type=SEED, default=1, show_default=True, help="Seed of the simulated errors.")
 @click.option("--wires", type=FILE, help="Write the addresses of the wires to this JSON file.")
 def sim(cell: Path, job: Path | None, seed: int, wires: Path | None) -> int:
     """Serve the simulated devices of a cell on real wires until interrupted.
@@ -186,11 +192,11 @@ def study() -> None:
 
 @study.command("dock")
 @click.argument("cells", type=FILE, nargs=-1)
-@click.option("--seeds", default=100, show_default=True, help="How many seeds a cell.")
+@click.option("--seeds", type=COUNT, default=100, show_default=True, help="How many seeds a cell.")
 @click.option(
     "--out", type=FILE, default=Path("studies"), show_default=True, help="Where results are kept and resumed."
 )
-@click.option("--workers", type=int, help="Processes (default: one a core).")
+@click.option("--workers", type=COUNT, help="Processes (default: one a core).")
 @click.option(
     "--stress", is_flag=True, help="Stress study: all unmodelled errors at stress size, false acceptance counted."
 )
@@ -268,13 +274,27 @@ def call(arguments: list[str]) -> int:
         where = error.ctx.command_path if error.ctx else "docking"
         if not as_json and error.ctx:
             click.echo(error.ctx.get_usage(), err=True)
-        return _fail(BadArgument(where, error.format_message(), value=" ".join(arguments[:1])), as_json)
+        return _fail(BadArgument(where, error.format_message(), value=" ".join(arguments)), as_json)
     except DockingError as error:
         return _fail(error, as_json)
     except (KeyboardInterrupt, click.Abort):
         return _fail(StoppedByOperator("docking", "interrupted from the keyboard"), as_json)
+    except Exception as error:  # noqa: BLE001 - the last resort: a user gets words, the traceback goes to a file
+        return _fail(_defect(error), as_json)
+
+
+def _defect(error: Exception) -> Defect:
+    """The program's own error in one line; the whole story is kept in a file."""
+    number, name = tempfile.mkstemp(prefix="docking-defect-", suffix=".txt")
+    os.close(number)
+    Path(name).write_text("".join(traceback.format_exception(error)), "utf-8")
+    return Defect("docking", f"{type(error).__name__}: {error} (details in {name})")
 
 
 def main() -> None:
     """Entry point of the `docking` program."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            # A terminal without the characters of a language shows their codes instead of ending the run.
+            stream.reconfigure(errors="backslashreplace")
     sys.exit(call(sys.argv[1:]))

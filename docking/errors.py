@@ -239,6 +239,10 @@ class BadArgument(ConfigError):
     code = 4004
 
 
+class FileUnwritable(ConfigError):
+    code = 4005
+
+
 # 5xxx planning and convergence -----------------------------------------------------------------------------------
 class PlanError(DockingError):
     """Planning and convergence."""
@@ -314,3 +318,9 @@ class JournalBusy(StateError):
 
 class JournalUnwritable(StateError):
     code = 6006
+
+
+class Defect(StateError):
+    """An error of the program itself."""
+
+    code = 6007

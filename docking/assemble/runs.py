@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import json
+import os
 import tempfile
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,7 @@ from docking.assemble.simulated import FarEnd, make_far_end, real_wires, truth_o
 from docking.cell import Cell
 from docking.config import CellFile, JobFile
 from docking.config.load import default_job_path, file_sha256, load_cell, load_job
-from docking.errors import BadArgument, FileUnreadable
+from docking.errors import BadArgument, FileUnreadable, FileUnwritable
 from docking.journal import JournalFile, read
 from docking.operators import AutomaticOperator, TerminalOperator
 from docking.ports import Operator, at_once
@@ -131,6 +133,8 @@ def run_on_wires(request: RunRequest, choice: WireChoice, say: Say, *, step: boo
 def serve(request: RunRequest, wires_file: Path | None, say: Say) -> None:
     """Serve the simulated devices of a cell on real wires until interrupted."""
     files = load_files(request)
+    if wires_file is not None:
+        _prepare(wires_file)
     with tempfile.TemporaryDirectory(prefix="docking-sim-") as folder:
 
         async def main() -> None:
@@ -142,8 +146,9 @@ def serve(request: RunRequest, wires_file: Path | None, say: Say) -> None:
             if wires_file is not None:
                 # Written whole and then renamed: a reader never meets half a file.
                 part = wires_file.with_suffix(".part")
-                part.write_text(text + "\n", "utf-8")
-                part.replace(wires_file)
+                with _writing(wires_file):
+                    part.write_text(text + "\n", "utf-8")
+                    part.replace(wires_file)
             say(text)
             say(tell(request.language, "served"))
             try:
@@ -261,13 +266,18 @@ def _finish(request: RunRequest, journal_path: Path, summary: dict[str, Any]) ->
     if request.report is not None:
         from docking.report import write_report
 
-        request.report.parent.mkdir(parents=True, exist_ok=True)
-        write_report(read(journal_path), request.report, request.language)
+        with _writing(request.report):
+            write_report(read(journal_path), request.report, request.language)
     return summary
 
 
 def _journal_path(request: RunRequest, stack: ExitStack) -> Path:
-    """Where the journal of this run goes: as asked, beside the report, or into a folder that ends with the run."""
+    """Where the journal of this run goes: as asked, beside the report, or into a folder that ends with the run.
+
+    Raises FileUnwritable before anything moves where journal or report cannot be written.
+    """
+    if request.report is not None:
+        _prepare(request.report)
     if request.journal is not None:
         return _fresh(request.journal)
     if request.report is not None:
@@ -277,20 +287,48 @@ def _journal_path(request: RunRequest, stack: ExitStack) -> Path:
 
 def _fresh(path: Path) -> Path:
     """One journal a run: an earlier one is kept beside it under the next free number."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    _prepare(path)
     if path.exists():
         n = 1
         while (kept := path.with_name(f"{path.stem}.{n}{path.suffix}")).exists():
             n += 1
-        path.rename(kept)
+        with _writing(path):
+            path.rename(kept)
     return path
 
 
-def _read_wires(path: Path, cell: CellFile) -> dict[str, Any]:
+def _prepare(path: Path) -> None:
+    """Make the folder of a file that is to be written, and find out whether it can be."""
+    with _writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        if not os.access(path.parent, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
     try:
-        found: dict[str, Any] = json.loads(path.read_text("utf-8"))
+        yield
+    except OSError as error:
+        raise FileUnwritable(str(path), (error.strerror or str(error)).lower()) from error
+
+
+def _read_wires(path: Path, cell: CellFile) -> dict[str, Any]:
+    """The addresses that `docking sim` wrote. Raises FileUnreadable, BadArgument when they are not this cell's."""
+    try:
+        found = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError) as error:
         raise FileUnreadable(str(path), str(error)) from error
     if not isinstance(found, dict) or found.get("cell") != cell.name:
         raise BadArgument("--wires", f"the file is not for cell {cell.name}", value=str(path))
+    if cell.bus.kind == "modbus-tcp":
+        listed = found.get("modbus")
+        whole = isinstance(listed, dict) and set(listed) == {p.name for p in cell.positioners}
+    else:
+        whole = isinstance(found.get("can"), str)
+    if not (whole and isinstance(found.get("tracker"), str)):
+        cause = "the file lacks addresses of this cell; let `docking sim` write it"
+        raise BadArgument("--wires", cause, value=str(path))
     return found
