@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
-import json
 import os
 import sys
 import tempfile
@@ -52,7 +52,9 @@ def _json_option(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _print_json(body: dict[str, Any]) -> None:
-    click.echo(json.dumps(body, ensure_ascii=False, allow_nan=False))
+    from docking.journal import canonical
+
+    click.echo(canonical(body))
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -221,7 +223,13 @@ def study_dock(cells: tuple[Path, ...], as_json: bool, **options: Any) -> int:
 
 def _say(as_json: bool) -> Callable[[str], None]:
     """Where progress goes: stdout for a person, stderr when stdout carries JSON."""
-    return lambda text: click.echo(text, err=as_json)
+
+    def say(text: str) -> None:
+        # A terminal that has gone away must not keep the axes from coming to rest in order.
+        with contextlib.suppress(OSError):
+            click.echo(text, err=as_json)
+
+    return say
 
 
 def _ended(summary: dict[str, Any], as_json: bool) -> int:

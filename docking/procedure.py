@@ -288,7 +288,10 @@ class Procedure:
         self.journal.write("moved", records.moved_record(plan, result))
         if result.cause is not None:
             raise result.cause
-        return Event.MOVED if result.result == "done" else Event.STOPPED
+        if result.result == "done":
+            return Event.MOVED
+        self.operator.notify("stopped_at", path_time_s=result.path_time_s, duration_s=plan.duration_s)
+        return Event.STOPPED
 
     def _check_start(self, plan: Plan) -> None:
         """Nothing may have moved an axis between planning and confirmation."""

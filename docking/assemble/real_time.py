@@ -32,9 +32,9 @@ def run_real(main: Callable[[], Coroutine[Any, Any, T]]) -> T:
 
 
 def on_interrupt(act: Callable[[], None]) -> None:
-    """Let Ctrl-C and a request to terminate call `act` on the running loop."""
+    """Let Ctrl-C, a request to terminate and the end of the terminal call `act` on the running loop."""
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         loop.add_signal_handler(number, act)
 
 
