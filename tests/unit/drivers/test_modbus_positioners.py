@@ -144,6 +144,21 @@ def test_a_stop_at_any_moment_leaves_the_axes_on_the_path(at_s: float, verb: str
     play(scenario, late_s=late_s, ramp_s=ramp_s)
 
 
+def test_a_resume_takes_the_others_to_the_end_when_one_has_reached_it_in_its_ramp() -> None:
+    async def scenario(bench: Bench) -> None:
+        await bench.run()
+        await bench.poll_for(7.6)
+        await bench.driver.command("hold")
+        await bench.poll_for(1.0)
+        assert bench.states() == [State.DONE, State.HELD, State.HELD, State.HELD]
+        await bench.driver.command("resume")
+        await bench.poll_for(2.0)
+        assert bench.states() == [State.DONE] * 4
+        np.testing.assert_allclose(bench.plant.position_mm, bench.plan.q_mm[-1], atol=0.0006)
+
+    play(scenario, ppm=(30000.0, 0.0, 0.0, 0.0))
+
+
 def test_hold_and_resume_reach_the_end_with_the_path_never_left() -> None:
     async def scenario(bench: Bench) -> None:
         await bench.run()
