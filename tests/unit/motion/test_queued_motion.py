@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -120,15 +121,21 @@ def test_a_stop_ends_the_move_where_the_axes_stand(share, held):
 
 
 def test_a_stop_is_over_only_when_the_ramp_is():
+    # So slow that two read-backs in a row never differ by more than an axis at rest.
+    slow = a_plan(replace(SITE, speed_mm_s=0.03, reach_mm=0.2, turn_deg=0.0), 3, period_s=0.1, queued=True)
+
     async def scenario(bench):
         loop = asyncio.get_running_loop()
-        move = await bench.begin()
-        # So slow at the beginning that the read-backs seem to stand still.
-        await asyncio.sleep(0.01)
+        await bench.motion.enable()
+        await bench.motion.load(slow)
+        move = loop.create_task(bench.motion.start(slow.plan_hash))
+        await asyncio.sleep(2.0)
         bench.motion.request("stop")
         asked = loop.time()
-        await move
+        result = await move
+        assert result.result == "stopped"
         assert loop.time() - asked >= RAMP_S
+        np.testing.assert_array_equal(await rests(bench), result.commanded_mm)
 
     on_bench(scenario)
 
