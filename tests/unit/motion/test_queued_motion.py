@@ -135,7 +135,7 @@ def test_a_stop_is_over_only_when_the_ramp_is():
         result = await move
         assert result.result == "stopped"
         assert loop.time() - asked >= RAMP_S
-        np.testing.assert_array_equal(await rests(bench), result.commanded_mm)
+        np.testing.assert_allclose(await rests(bench), result.commanded_mm, atol=1e-9)
 
     on_bench(scenario)
 
