@@ -51,10 +51,16 @@ def _json_option(command: Callable[..., Any]) -> Callable[..., Any]:
     )
 
 
+def _print(text: str, *, err: bool = False) -> None:
+    """Print; a terminal that has gone away changes neither what the cell does nor the exit code."""
+    with contextlib.suppress(OSError):
+        click.echo(text, err=err)
+
+
 def _print_json(body: dict[str, Any]) -> None:
     from docking.journal import canonical
 
-    click.echo(canonical(body))
+    _print(canonical(body))
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -223,20 +229,14 @@ def study_dock(cells: tuple[Path, ...], as_json: bool, **options: Any) -> int:
 
 def _say(as_json: bool) -> Callable[[str], None]:
     """Where progress goes: stdout for a person, stderr when stdout carries JSON."""
-
-    def say(text: str) -> None:
-        # A terminal that has gone away must not keep the axes from coming to rest in order.
-        with contextlib.suppress(OSError):
-            click.echo(text, err=as_json)
-
-    return say
+    return lambda text: _print(text, err=as_json)
 
 
 def _ended(summary: dict[str, Any], as_json: bool) -> int:
     if as_json:
         _print_json(summary)
     else:
-        click.echo(_summary_text(summary))
+        _print(_summary_text(summary))
     return EXIT_OF_OUTCOME[summary["outcome"]]
 
 
@@ -268,7 +268,7 @@ def _fail(error: DockingError, as_json: bool) -> int:
     if as_json:
         _print_json(_error_json(error))
     else:
-        click.echo(f"{error.code}: {error.text(language())}\n    -> {error.remedy(language())}", err=True)
+        _print(f"{error.code}: {error.text(language())}\n    -> {error.remedy(language())}", err=True)
     return error.exit_code
 
 
@@ -281,7 +281,7 @@ def call(arguments: list[str]) -> int:
     except click.UsageError as error:
         where = error.ctx.command_path if error.ctx else "docking"
         if not as_json and error.ctx:
-            click.echo(error.ctx.get_usage(), err=True)
+            _print(error.ctx.get_usage(), err=True)
         return _fail(BadArgument(where, error.format_message(), value=" ".join(arguments)), as_json)
     except DockingError as error:
         return _fail(error, as_json)
@@ -305,4 +305,10 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             # A terminal without the characters of a language shows their codes instead of ending the run.
             stream.reconfigure(errors="backslashreplace")
-    sys.exit(call(sys.argv[1:]))
+    code = call(sys.argv[1:])
+    try:
+        sys.stdout.flush()
+    except OSError:
+        # Python would try again at its end, and end with a code of its own.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.exit(code)

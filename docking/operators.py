@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import select
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -130,6 +131,9 @@ class TerminalOperator:
 
     async def _ask(self, expected: frozenset[str], key: str, **facts: Any) -> str:
         self._engaged, self._asked = True, expected
+        while not self._gone and select.select([self._descriptor], [], [], 0.0)[0]:
+            # What was typed ahead reaches nobody but an abort.
+            self._readable()
         answer: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         self._answer = answer
         self.notify(key, **facts)
