@@ -104,7 +104,7 @@ def plan_settings(cell: CellFile, job: JobFile) -> PlanSettings:
         stroke_margin_mm=limits.stroke_margin_mm,
         reaction_min_fraction=limits.reaction_min_fraction,
         chord_error_mm=limits.chord_error_mm,
-        sync_error_mm=limits.ball_residual_warn_mm,
+        sync_error_mm=limits.sync_error_mm,
         start_skew_s=bus.start_skew_s if isinstance(bus, ModbusBus) else 0.0,
         clock_ppm=bus.clock_ppm if isinstance(bus, ModbusBus) else 0.0,
         playback_ramp_s=bus.ramp_s if isinstance(bus, ModbusBus) else 0.0,

@@ -124,7 +124,6 @@ class PositionerConfig(Model):
 
 class LoadCellConfig(Model):
     range_n: tuple[Positive, Positive, Positive] = Field(description="along X, Y, Z, N")
-    noise_n: Positive = Field(default=25.0, description="1 sigma, N")
 
 
 class SettleConfig(Model):
@@ -141,14 +140,17 @@ class LimitsConfig(Model):
     following_error_vmax_mm: Positive = Field(
         default=0.5, description="stop above it at full axis speed, in proportion below, mm"
     )
-    ball_residual_warn_mm: Positive = Field(
-        default=0.05, description="warn when the read-backs part from a rigid figure by more, mm"
+    sync_error_mm: Positive = Field(
+        default=0.05,
+        description="how far positioners on clocks of their own may squeeze the ball figure on the way; bounds the "
+        "speed of a plan, mm",
     )
-    ball_residual_mm: Positive = Field(default=0.1, description="stop when they part by more, mm")
-    internal_force_warn_n: Positive = Field(
-        default=500.0, description="warn above this predicted internal force at a ball, N"
+    ball_residual_mm: Positive = Field(
+        default=0.1, description="stop when the read-backs part from a rigid figure by more, mm"
     )
-    internal_force_n: Positive = Field(default=1500.0, description="stop above it, N")
+    internal_force_n: Positive = Field(
+        default=1500.0, description="stop above this internal force at a ball, predicted from the read-backs, N"
+    )
     warp_force_n: Positive = Field(default=300.0, description="stop above this warp force of the vertical axes, N")
     reaction_min_fraction: Fraction = Field(
         default=0.1, description="least upward ball reaction, as a fraction of the equal share of the weight"

@@ -144,8 +144,7 @@ def _limits(doc: Document) -> list[Finding]:
     limits = doc.get("limits", {})
     pairs = (
         ("following_error_rest_mm", "following_error_vmax_mm"),
-        ("ball_residual_warn_mm", "ball_residual_mm"),
-        ("internal_force_warn_n", "internal_force_n"),
+        ("sync_error_mm", "ball_residual_mm"),
         ("station_correction_min_mm", "station_correction_max_mm"),
     )
     return [finding for low, high in pairs for finding in _in_order(limits, low, high, "limits.")]

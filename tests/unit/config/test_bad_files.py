@@ -136,9 +136,9 @@ CELL_CASES = {
     ),
     "Z follows": (put("positioners.3.axes.2.driven", False), ["positioners[3].axes[2].driven", "D.Z", "tips"]),
     "gravity of no direction": (put("gravity_direction", [0.0, 0.0, 0.0]), ["gravity_direction", "length 0", "unit"]),
-    "warn over stop": (
-        put("limits.internal_force_warn_n", 900.0),
-        ["limits.internal_force_warn_n", "900", "limits.internal_force_n = 150"],
+    "budget over stop": (
+        put("limits.sync_error_mm", 0.2),
+        ["limits.sync_error_mm", "0.2", "limits.ball_residual_mm = 0.1"],
     ),
     "heartbeat slower than its guard": (
         put("bus.heartbeat_s", 0.5),
