@@ -14,7 +14,6 @@ import numpy as np
 
 from docking import records
 from docking.approach import Approach, Station
-from docking.cross_check import CrossCheck
 from docking.errors import (
     AmbiguousSet,
     DockingError,
@@ -24,6 +23,7 @@ from docking.errors import (
     PermissiveMissing,
     PlanStale,
 )
+from docking.independent_points import IndependentPoints
 from docking.kinematics import Positioners, ball_reactions_n, figure_residual_mm, pose_from_axes, sink_mm
 from docking.motion.settle import SettleSettings, settle
 from docking.planning import Action, Attempt, GuardSettings, PlanRequest, PlanSettings, check_correction, make_plan
@@ -92,7 +92,7 @@ class Procedure:
         self._settings, self._approach, self._survey = settings, approach, survey
         self.motion, self.journal, self.operator = motion, journal, operator
         self.progress = Progress()
-        self._cross_check = CrossCheck(survey, journal, settings.target_residual_mm, self._set_aside)
+        self._independent = IndependentPoints(survey, journal, settings.target_residual_mm, self._set_aside)
         self.effects: dict[Effect, Callable[[], Awaitable[Event]]] = {
             Effect.CONNECT: self._connect,
             Effect.ENABLE: self._enable,
@@ -208,7 +208,7 @@ class Procedure:
             tolerance_mm=float(errors.tolerance_mm[i]),
         )
         last = p.passes >= self._approach.convergence.max_passes
-        agree = self._cross_check.check_points(fit, last=last) and self._cross_check.features(fit, mate, last=last)
+        agree = self._independent.check_points(fit, last=last) and self._independent.features(fit, mate, last=last)
         return self._decide(station) if agree else Event.MEASURE_MORE
 
     def _set_aside(self, error: DockingError) -> None:
@@ -256,12 +256,22 @@ class Procedure:
     async def _ask(self) -> Event:
         plan, shown = self._planned(), self._shown()
         self.operator.show(plan, shown)
-        missing = await self.operator.permissives(self._station().permissives)
+        station = self._station()
+        missing = await self.operator.permissives(station.permissives)
+        body = {"stage": station.name, "declared": [n for n in station.permissives if n not in missing]}
+        self.journal.write("permissives", {**body, "missing": list(missing)})
         if missing:
-            raise PermissiveMissing(missing[0], value=self._station().name)
+            raise PermissiveMissing(missing[0], value=station.name)
         go = await self.operator.confirm(plan, shown)
         self.journal.write("confirm", {"plan_hash": plan.plan_hash, "go": go})
+        if go and not (self._fit_age_s() <= self._settings.fit_age_s):
+            self.operator.notify("stale", age_s=self._fit_age_s(), limit_s=self._settings.fit_age_s)
+            self.progress.passes = 0
+            return Event.STALE
         return Event.CONFIRMED if go else Event.DECLINED
+
+    def _fit_age_s(self) -> float:
+        return self._survey.clock() - self.progress.fitted_at_s
 
     def _shown(self) -> dict[str, Any]:
         """The features' deviation from the goal of the planned move, and which axes only follow."""
@@ -272,9 +282,6 @@ class Procedure:
 
     async def _move(self) -> Event:
         p, plan = self.progress, self._planned()
-        age = self._survey.clock() - p.fitted_at_s
-        if not (age <= self._settings.fit_age_s):
-            raise PlanStale(plan.stage, f"its fit is {age:.0f} s old, at most {self._settings.fit_age_s:.0f} s")
         self._check_start(plan)
         self.journal.write("intent", records.intent_record(plan), durable=True)
         await self.motion.load(plan)
@@ -329,8 +336,7 @@ class Procedure:
         return _known(self._survey.X_WM, "pose of the mate")
 
     def _drift_sigma_mm(self) -> float:
-        """Drift of the station assumed since the references were last checked."""
-        return self._settings.drift_mm_per_s * max(0.0, self._survey.clock() - self._survey.checked_at_s)
+        return self._survey.drift_sigma_mm(self._settings.drift_mm_per_s)
 
 
 T = TypeVar("T")

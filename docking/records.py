@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -130,4 +131,5 @@ def alarm_record(alarm: Alarm) -> dict[str, Any]:
         "value": alarm.value,
         "limit": alarm.limit,
         "remedy": alarm.remedy,
+        "t_s": alarm.t_s if math.isfinite(alarm.t_s) else None,
     }

@@ -69,6 +69,7 @@ class Event(Enum):
     PLANNED = "planned"
     CONFIRMED = "confirmed"
     DECLINED = "declined"
+    STALE = "stale"
     MOVED = "moved"
     HOLD = "hold"
     RESUME = "resume"
@@ -148,6 +149,7 @@ TABLE: dict[tuple[State, Event], Transition] = {
     (S.PLAN, E.PLANNED): Transition(S.CONFIRM, (F.ASK,)),
     (S.CONFIRM, E.CONFIRMED): Transition(S.MOVE, (F.MOVE,)),
     (S.CONFIRM, E.DECLINED): Transition(S.RECOVER),
+    (S.CONFIRM, E.STALE): Transition(S.MEASURE, (F.MEASURE,)),
     (S.MOVE, E.HOLD): Transition(S.PAUSED, (F.HOLD,)),
     (S.MOVE, E.MOVED): Transition(S.SETTLE, (F.SETTLE,)),
     (S.MOVE, E.ABORT): Transition(S.STOPPING, (F.STOP,)),

@@ -69,6 +69,8 @@ class StudyRequest:
                 raise BadArgument("--error", "write NAME=SCALE with a number", value=option) from None
             if name not in ERROR_NAMES:
                 raise BadArgument("--error", f"the names are {', '.join(ERROR_NAMES)}", value=name)
+            if not 0.0 <= result[name] < float("inf"):
+                raise BadArgument("--error", "a scale is a finite number, not negative", value=option)
         return result
 
 
@@ -77,6 +79,8 @@ def study_dock(request: StudyRequest, say: Say) -> dict[str, Any]:
     for option, number in (("--seeds", request.seeds), ("--workers", request.workers)):
         if number is not None and number < 1:
             raise BadArgument(option, "at least one is needed", value=number, limit=1)
+    if request.tolerance_mm is not None and not 0.0 < request.tolerance_mm < float("inf"):
+        raise BadArgument("--tolerance-mm", "a positive length is needed", value=request.tolerance_mm)
     cells = request.cells or tuple(_reference_cells())
     request.out.mkdir(parents=True, exist_ok=True)
     return {"cells": [_study_cell(cell, request, say) for cell in cells]}

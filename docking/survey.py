@@ -59,6 +59,8 @@ class Survey:
     X_WT: Fit | None = None
     X_WM: Fit | None = None
     checked_at_s: float = float("nan")
+    located_at_s: float = float("nan")
+    shift_sigma_mm: float = 0.0
     component: Points | None = None
     checks: Points | None = None
     features: tuple[Points, Points] | None = None
@@ -92,7 +94,8 @@ class Survey:
         self.X_WM = await self.aside(lambda: fit_pose(screen(self.nominals.mate, mate, fit), fit))
         self.journal.write("fit", fit_record(self.X_WM, "mate", "frame"))
         self._keep_references(ers, mate)
-        self.checked_at_s = self.clock()
+        self.checked_at_s = self.located_at_s = self.clock()
+        self.shift_sigma_mm = 0.0
 
     async def measure_component(self, X_WC_guess: Pose, X_WM_guess: Pose, passes: int, *, more: bool = False) -> None:
         """Measure targets and check points in `passes` passes, then the references; again if the station moved.
@@ -155,17 +158,21 @@ class Survey:
 
     async def _check_faces(self, X_WT: Pose) -> None:
         if not self.tracker.two_face:
-            return
-        name, p_W = self.nominals.ers.names[0], self.nominals.ers.xyz_mm[0]
-        near = X_WT.inverse().apply(p_W)
-        one = await self.tracker.measure(name, near, 1)
-        two = await self.tracker.measure(name, near, 2)
+            return None
+        for name, p_W in zip(self.nominals.ers.names, self.nominals.ers.xyz_mm, strict=True):
+            near = X_WT.inverse().apply(p_W)
+            one, two = await self._one(name, near, 1), await self._one(name, near, 2)
+            if one is not None and two is not None:
+                return self._compare_faces(one, two)
+        raise TargetLost(self.nominals.ers.names[0], "no reference point is seen in both faces")
+
+    def _compare_faces(self, one: Reading, two: Reading) -> None:
         gap = float(np.linalg.norm(one.p_T_mm - two.p_T_mm))
         sigma = float(np.sqrt(np.trace(one.cov_mm2 + two.cov_mm2)))
         limit = max(self.settings.two_face_limit_mm, self.settings.drift_sigmas * sigma)
-        self.journal.write("two_face", {"target": name, "difference_mm": gap, "limit_mm": limit})
+        self.journal.write("two_face", {"target": one.target, "difference_mm": gap, "limit_mm": limit})
         if not (gap <= limit):
-            raise TwoFaceDisagrees(name, value=gap, limit=limit)
+            raise TwoFaceDisagrees(one.target, value=gap, limit=limit)
 
     async def _measure_W(self, group: str, nominal: Points, X_WN: Pose, passes: int) -> Points:
         X_WT = self._station()
@@ -186,11 +193,11 @@ class Survey:
         self.journal.write("measurement", {"group": group, "readings": [_row(*r) for r in rows], "lost": lost})
         return _points(rows)
 
-    async def _one(self, name: str, near_T_mm: Array) -> Reading | None:
+    async def _one(self, name: str, near_T_mm: Array, face: int = 1) -> Reading | None:
         """One reading; measuring moves nothing, so a silent instrument is asked a second time."""
         for attempt in range(self.settings.attempts):
             try:
-                return await self.tracker.measure(name, near_T_mm)
+                return await self.tracker.measure(name, near_T_mm, face)
             except TargetLost:
                 continue
             except DeviceSilent:
@@ -205,6 +212,13 @@ class Survey:
             return _picked(nominal, []), Points((), np.zeros((0, 3)), np.zeros((0, 3, 3)))
         seen = _averaged(self.checks, self.settings.component_fit)
         return _picked(nominal, [nominal.names.index(n) for n in seen.names]), seen
+
+    def drift_sigma_mm(self, rate_mm_per_s: float) -> float:
+        """What may have drifted unseen: since the last check at the given rate, and before it what the check cannot
+        tell from no shift, never more than the same rate allows."""
+        since_check = rate_mm_per_s * max(0.0, self.clock() - self.checked_at_s)
+        before = rate_mm_per_s * max(0.0, self.checked_at_s - self.located_at_s)
+        return since_check + min(before, self.shift_sigma_mm)
 
     def leave_out(self, check_point: str) -> None:
         """Measure and judge this check point no more."""
@@ -236,6 +250,7 @@ class Survey:
                     break
             if shift.moved:
                 raise StationMoved(group, "seen against the references", value=shift.worst_mm, limit=shift.limit_mm)
+            self.shift_sigma_mm = shift.common_sigma_mm
             body = {"shift_mm": shift.worst_mm, "limit_mm": shift.limit_mm, "restationed": False}
             self.journal.write("drift", {"reference": group, **body})
         self.checked_at_s = self.clock()

@@ -44,6 +44,7 @@ DECISION_RULE = (
     "e + 2 sigma <= tolerance for every docking feature (ISO 14253-1, k = 2), "
     "and at most 2.5 % risk that any feature is out of tolerance (JCGM 106)"
 )
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
 Say = Callable[[str], None]
 
 
@@ -315,12 +316,27 @@ def _writing(path: Path) -> Iterator[None]:
         raise FileUnwritable(str(path), (error.strerror or str(error)).lower()) from error
 
 
+def _refuse_real_devices(path: Path, found: dict[str, Any]) -> None:
+    """Simulated devices live on this machine: on a pty, a local socket, the loopback interface. Nothing else is moved
+    without a person."""
+    listed = found.get("modbus")
+    hosts = [str(at[0]) for at in listed.values() if at] if isinstance(listed, dict) else []
+    far = [host for host in hosts if host not in LOOPBACK]
+    tracker, can = str(found.get("tracker", "")), str(found.get("can", ""))
+    far += [tracker] if tracker and not tracker.startswith("/dev/pts/") else []
+    far += [can] if can and not Path(can).is_socket() else []
+    if far:
+        raise BadArgument("--wires", f"{far[0]} is no simulated device of this machine", value=str(path))
+
+
 def _read_wires(path: Path, cell: CellFile) -> dict[str, Any]:
     """The addresses that `docking sim` wrote. Raises FileUnreadable, BadArgument when they are not this cell's."""
     try:
         found = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise FileUnreadable(str(path), str(error)) from error
+    except OSError as error:
+        raise FileUnreadable(str(path), (error.strerror or str(error)).lower()) from error
+    except ValueError as error:
+        raise FileUnreadable(str(path), f"not JSON: {error}") from error
     if not isinstance(found, dict) or found.get("cell") != cell.name:
         raise BadArgument("--wires", f"the file is not for cell {cell.name}", value=str(path))
     if cell.bus.kind == "modbus-tcp":
@@ -328,6 +344,7 @@ def _read_wires(path: Path, cell: CellFile) -> dict[str, Any]:
         whole = isinstance(listed, dict) and set(listed) == {p.name for p in cell.positioners}
     else:
         whole = isinstance(found.get("can"), str)
+    _refuse_real_devices(path, found)
     if not (whole and isinstance(found.get("tracker"), str)):
         cause = "the file lacks addresses of this cell; let `docking sim` write it"
         raise BadArgument("--wires", cause, value=str(path))

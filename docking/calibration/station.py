@@ -39,7 +39,8 @@ def to_world(X_WT: Pose, readings: Points) -> Points:
 class ReferenceShift:
     """Re-measured reference points against where they were: `shift_mm` (n, 3) in W, `sigma_mm` (n,) its uncertainty.
 
-    `common_mm` (3,) is their weighted mean shift. `moved` is the verdict, `worst_mm` and `limit_mm` its numbers:
+    `common_mm` (3,) is their weighted mean shift, known to `common_sigma_mm`. `moved` is the verdict, `worst_mm` and
+    `limit_mm` its numbers:
     the common shift when that decides, else the point nearest to or farthest beyond its limit.
     """
 
@@ -50,6 +51,7 @@ class ReferenceShift:
     moved: bool
     worst_mm: float
     limit_mm: float
+    common_sigma_mm: float
 
 
 def reference_shift(X_WT: Pose, reference: Points, readings: Points, sigmas: float = 3.0) -> ReferenceShift:
@@ -94,4 +96,5 @@ def _verdict(names: tuple[str, ...], shift: Array, cov: Array, probability: floa
     value = float(np.linalg.norm(size))
     moved = not (ratio <= 1.0)
     limit = value / float(np.sqrt(ratio)) if ratio > 0.0 else float("inf")
-    return ReferenceShift(names, shift, largest_sigma_mm(cov), mean, moved, value, limit)
+    common_sigma = float(largest_sigma_mm(mean_cov[None])[0])
+    return ReferenceShift(names, shift, largest_sigma_mm(cov), mean, moved, value, limit, common_sigma)

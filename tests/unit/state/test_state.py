@@ -47,6 +47,7 @@ PLAN              PLANNED              CONFIRM           ASK
 PLAN              ABORT                RECOVER
 CONFIRM           CONFIRMED            MOVE              MOVE
 CONFIRM           DECLINED             RECOVER
+CONFIRM           STALE                MEASURE           MEASURE
 CONFIRM           ABORT                RECOVER
 MOVE              HOLD                 PAUSED            HOLD
 MOVE              MOVED                SETTLE            SETTLE
