@@ -194,10 +194,6 @@ class TwoFaceDisagrees(PoseError):
     code = 3009
 
 
-class MateMoved(PoseError):
-    code = 3010
-
-
 class UnitMixUp(PoseError):
     code = 3011
 

@@ -1,4 +1,4 @@
-"""Rotations and rigid poses: SO(3) and SE(3), Euler angles at the border, interpolation.
+"""Rotations and rigid poses: rotation vectors, Euler angles at the border.
 
 Rotation vectors are rad, Euler angles (alpha, beta, gamma) follow [Luo]: `R = Rz(gamma) Ry(beta) Rx(alpha)`,
 rotations about the fixed axes X, Y, Z in this order.
@@ -6,7 +6,7 @@ rotations about the fixed axes X, Y, Z in this order.
 
 from __future__ import annotations
 
-from math import atan2, cos, degrees, hypot, pi, radians, sin, sqrt
+from math import atan2, cos, degrees, hypot, radians, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -83,31 +83,6 @@ def rotation_angle(R: ArrayLike) -> float:
     return float(np.linalg.norm(log_so3(R)))
 
 
-def _left_jacobian(w: Array) -> Array:
-    """V (3, 3) of the SE(3) exponential: `t = V v`."""
-    angle = float(np.linalg.norm(w))
-    k = skew(w)
-    if angle < 1e-3:
-        a, b = 0.5 - angle**2 / 24.0 + angle**4 / 720.0, 1.0 / 6.0 - angle**2 / 120.0 + angle**4 / 5040.0
-    else:
-        half = sin(angle / 2.0) / angle
-        a, b = 2.0 * half * half, (angle - sin(angle)) / angle**3
-    result: Array = np.eye(3) + a * k + b * (k @ k)
-    return result
-
-
-def exp_se3(twist: ArrayLike) -> Pose:
-    """Pose of a twist (6,) = [rotation_rad (3), translation_mm (3)]."""
-    xi = np.asarray(twist, dtype=np.float64)
-    return Pose(exp_so3(xi[:3]), _left_jacobian(xi[:3]) @ xi[3:])
-
-
-def log_se3(X: Pose) -> Array:
-    """Twist (6,) = [rotation_rad (3), translation_mm (3)] of a pose; `exp_se3(log_se3(X)) = X`."""
-    w = log_so3(X.R)
-    return np.concatenate([w, np.linalg.solve(_left_jacobian(w), X.t_mm)])
-
-
 def euler_to_matrix(alpha_rad: float, beta_rad: float, gamma_rad: float) -> Array:
     """R (3, 3) = Rz(gamma) Ry(beta) Rx(alpha), [Luo] Eq. 2."""
     sa, ca = sin(alpha_rad), cos(alpha_rad)
@@ -145,30 +120,6 @@ def pose_to_vector(X: Pose) -> Array:
     """Border form (6,) [x_mm, y_mm, z_mm, alpha_deg, beta_deg, gamma_deg] of a pose; alpha = 0 in gimbal lock."""
     e = matrix_to_euler(X.R)
     return np.array([*X.t_mm, degrees(e.alpha_rad), degrees(e.beta_rad), degrees(e.gamma_rad)])
-
-
-def orthonormal(R: ArrayLike) -> Array:
-    """The rotation nearest to R (3, 3), to remove rounding that long products gather."""
-    u, _, vt = np.linalg.svd(np.asarray(R, dtype=np.float64))
-    result: Array = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return result
-
-
-def interpolate(X0: Pose, X1: Pose, s: float, pivot_mm: ArrayLike = (0.0, 0.0, 0.0)) -> Pose:
-    """Pose at s in 0..1 from X0 to X1 (domain 5.1): `R(s) = R0 exp(s log(R0^T R1))`, the pivot on a straight line.
-
-    `pivot_mm` (3,) is the body point, in the body's own frame, that travels the line.
-    """
-    c = np.asarray(pivot_mm, dtype=np.float64)
-    R = X0.R @ exp_so3(s * log_so3(X0.R.T @ X1.R))
-    at = (1.0 - s) * X0.apply(c) + s * X1.apply(c)
-    return Pose(R, at - R @ c)
-
-
-def wrap_angle(angle_rad: float) -> float:
-    """The same angle in (-pi, pi]."""
-    turned = (angle_rad + pi) % (2.0 * pi) - pi
-    return pi if turned == -pi else turned
 
 
 def rms(vectors: ArrayLike) -> float:

@@ -46,12 +46,6 @@ class Pose(_Frozen):
     def identity() -> Pose:
         return Pose(np.eye(3), np.zeros(3))
 
-    @staticmethod
-    def from_matrix(matrix: ArrayLike) -> Pose:
-        """Pose from a homogeneous (4, 4) matrix."""
-        m = np.asarray(matrix, dtype=np.float64)
-        return Pose(m[:3, :3], m[:3, 3])
-
     def matrix(self) -> Array:
         """Homogeneous (4, 4) matrix."""
         m = np.eye(4)
@@ -160,18 +154,6 @@ class Fit(_Frozen):
         result: Array = q + self.expansion * (q - self.pivot_mm)
         return result
 
-    def point_jacobian(self, p_M_mm: ArrayLike) -> Array:
-        """How points (n, 3) in M move with rotation, translation and expansion (n, 3, 7)."""
-        arm = np.atleast_2d(np.asarray(p_M_mm, dtype=np.float64)) - self.pivot_mm
-        jac = np.zeros((len(arm), 3, 7))
-        x, y, z = arm.T
-        jac[:, 0, 1], jac[:, 0, 2] = z, -y
-        jac[:, 1, 0], jac[:, 1, 2] = -z, x
-        jac[:, 2, 0], jac[:, 2, 1] = y, -x
-        jac[:, :, 3:6] = np.eye(3)
-        jac[:, :, 6] = arm
-        return jac
-
     def whole_cov(self) -> Array:
         """Covariance (7, 7) of pose and expansion; zero in its last row where the expansion was not estimated."""
         cov = np.zeros((7, 7))
@@ -179,12 +161,6 @@ class Fit(_Frozen):
         if self.expansion_cov is not None:
             cov[6, :] = cov[:, 6] = self.expansion_cov
         return cov
-
-    def point_cov_mm2(self, p_M_mm: ArrayLike) -> Array:
-        """Covariance (n, 3, 3) that the uncertainty of pose and expansion gives the points `p_M_mm` (n, 3)."""
-        jac = self.point_jacobian(p_M_mm)
-        result: Array = jac @ self.whole_cov() @ jac.transpose(0, 2, 1)
-        return result
 
 
 RISK_LIMIT = 0.025

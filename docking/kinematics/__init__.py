@@ -12,7 +12,7 @@ from docking.kinematics.forces import (
     sink_mm,
     warp_rows,
 )
-from docking.kinematics.forward import figure_residual_mm, pairwise_residual_mm, pose_from_axes
+from docking.kinematics.forward import figure_residual_mm, pose_from_axes
 from docking.kinematics.monitor import CouplingMonitor, coupling_monitor
 from docking.kinematics.positioners import (
     Conditioning,
@@ -45,7 +45,6 @@ __all__ = [
     "figure_residual_mm",
     "internal_force_matrix",
     "internal_forces_n",
-    "pairwise_residual_mm",
     "pose_from_axes",
     "reaction_extremes",
     "sink_mm",

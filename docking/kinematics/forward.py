@@ -49,15 +49,3 @@ def figure_residual_mm(positioners: Positioners, q_mm: ArrayLike, X_WC: Pose) ->
     """Socket less ball, e_i = o_i + A_i q_i - X_WC b_i (k, 3); equation (9)."""
     result: Array = socket_positions(positioners, q_mm) - X_WC.apply(positioners.balls_C_mm)
     return result
-
-
-def pairwise_residual_mm(sockets_W_mm: ArrayLike, balls_mm: ArrayLike) -> Array:
-    """| p_i - p_j | - | b_i - b_j | (..., k, k) of a socket figure (..., k, 3) against the ball figure (k, 3)."""
-
-    def distances(points: Array) -> Array:
-        result: Array = np.linalg.norm(points[..., :, None, :] - points[..., None, :, :], axis=-1)
-        return result
-
-    figure, balls = np.asarray(sockets_W_mm, dtype=np.float64), np.asarray(balls_mm, dtype=np.float64)
-    gap: Array = distances(figure) - distances(balls)
-    return gap

@@ -14,7 +14,7 @@ import numpy as np
 from docking.errors import CheckPointDisagrees, SigmaMissing
 from docking.pose.quantiles import chi2_upper
 from docking.pose.svd import fit_svd
-from docking.pose.uncertainty import largest_sigma_mm
+from docking.pose.uncertainty import joint_cov_mm2, largest_sigma_mm, own_cov_mm2
 from docking.types import Array, FeatureErrors, Fit, Points, Pose
 
 _RISK_DRAWS = 8192
@@ -71,13 +71,8 @@ def _fit_cov_mm2(fit: Fit, p_W_mm: Array, expansion_sigma: float) -> Array:
     A fit whose residuals are larger than its covariances say is believed less, by its chi-square per degree of freedom
     (Birge ratio): the covariances miss something, and the features are where it would show.
     """
-    cov = fit.whole_cov()
-    if fit.expansion_cov is None:
-        cov[6, 6] = expansion_sigma**2
-    jac = fit.point_jacobian(p_W_mm).reshape(-1, 7)
     birge = max(1.0, fit.chi2 / fit.dof) if fit.dof > 0 else 1.0
-    result: Array = birge * (jac @ cov @ jac.T)
-    return result
+    return birge * joint_cov_mm2(fit, p_W_mm, expansion_sigma)
 
 
 def feature_errors(
@@ -106,13 +101,17 @@ def feature_errors(
     if not bool(np.all(np.isfinite(joint))):
         raise SigmaMissing("feature", "a fit has no covariance", value="the pose")
     error = at_c - at_m - (np.zeros(3) if standoff_W_mm is None else standoff_W_mm)
-    own = np.array([joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(count)])
-    risk = _risk(error, joint, features.tolerance_mm)
-    return FeatureErrors(features.names, error, largest_sigma_mm(own), features.tolerance_mm, risk)
+    risk = specific_risk(error, joint, features.tolerance_mm)
+    sigma = largest_sigma_mm(own_cov_mm2(joint))
+    return FeatureErrors(features.names, error, sigma, features.tolerance_mm, risk)
 
 
-def _risk(error_mm: Array, joint_mm2: Array, tolerance_mm: Array) -> float:
-    """Probability that a feature is outside its tolerance, from fixed draws: the same data give the same number."""
+def specific_risk(error_mm: Array, joint_mm2: Array, tolerance_mm: Array) -> float:
+    """Probability that any feature is out of its tolerance, given what was measured (specific risk, JCGM 106).
+
+    `error_mm` (n, 3), `joint_mm2` (3n, 3n) the covariance of all errors together, `tolerance_mm` (n,). From fixed
+    draws: the same data give the same number.
+    """
     values, vectors = np.linalg.eigh(joint_mm2)
     draws = np.random.default_rng(_RISK_SEED).standard_normal((_RISK_DRAWS, len(joint_mm2)))
     off = draws @ (vectors * np.sqrt(np.maximum(values, 0.0))).T + error_mm.reshape(-1)
@@ -149,13 +148,12 @@ def check_points_agree(fit: Fit, nominal: Points, measured: Points, false_alarm:
     predicted = fit.predict(nominal.xyz_mm)
     off = measured.xyz_mm - predicted
     R, count = fit.X_MN.R, len(off)
-    jac = fit.point_jacobian(predicted).reshape(-1, 7)
-    joint = jac @ fit.whole_cov() @ jac.T
+    joint = joint_cov_mm2(fit, predicted)
     for i, own in enumerate(measured.cov_mm2 + R @ nominal.cov_mm2 @ R.T):
         joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += own
     if not bool(np.all(np.isfinite(joint))):
         raise SigmaMissing("check point", value="a check point")
-    cov = np.array([joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(count)])
+    cov = own_cov_mm2(joint)
     statistic = np.einsum("ni,ni->n", off, np.linalg.solve(cov, off[:, :, None])[:, :, 0])
     size = np.linalg.norm(off, axis=1)
     quantile = chi2_upper(false_alarm / max(count, 1), 3)

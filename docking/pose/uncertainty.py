@@ -59,10 +59,24 @@ def pose_difference(X_est: Pose, X_true: Pose, pivot_mm: Array) -> Array:
     return np.concatenate([w, X_est.apply(at) - pivot_mm])
 
 
-def nees(fit: Fit, X_true: Pose) -> float:
-    """Normalised squared error of a fit against the truth: mean 6 when its covariance is honest."""
-    d = pose_difference(fit.X_MN, X_true, fit.pivot_mm)
-    return float(d @ np.linalg.solve(fit.cov, d))
+def joint_cov_mm2(fit: Fit, points_M_mm: Array, expansion_sigma: float = 0.0) -> Array:
+    """Joint covariance (3n, 3n) that the uncertainty of a fit's pose and expansion gives the points (n, 3) in M.
+
+    `expansion_sigma` (1 sigma, relative) stands in where the fit did not estimate the expansion.
+    """
+    cov = fit.whole_cov()
+    if fit.expansion_cov is None:
+        cov[6, 6] = expansion_sigma**2
+    jac = design(points_M_mm, fit.pivot_mm).reshape(-1, 7)
+    result: Array = jac @ cov @ jac.T
+    return result
+
+
+def own_cov_mm2(joint_mm2: Array) -> Array:
+    """The covariance (n, 3, 3) of each point out of the joint one (3n, 3n)."""
+    places = np.arange(len(joint_mm2) // 3)
+    result: Array = joint_mm2.reshape(len(places), 3, -1, 3)[places, :, places, :]
+    return result
 
 
 def largest_sigma_mm(cov_mm2: Array) -> Array:

@@ -7,8 +7,8 @@ from docking.calibration import locate_station, reference_shift, to_world
 from docking.errors import NotCongruent, SigmaMissing, TooFewPoints
 from docking.geometry import euler_to_matrix
 from docking.pose import LASER_TRACKER
-from docking.pose.uncertainty import nees
 from docking.types import Points, Pose
+from tests.support.nees import nees
 
 X_WT = Pose(euler_to_matrix(0.01, -0.02, 2.1), np.array([500.0, -9000.0, 800.0]))
 ERS = np.array(

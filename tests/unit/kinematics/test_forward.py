@@ -12,9 +12,7 @@ from docking.errors import FrameImplausible
 from docking.kinematics import (
     axis_positions,
     figure_residual_mm,
-    pairwise_residual_mm,
     pose_from_axes,
-    socket_positions,
 )
 from docking.types import Pose
 from tests.reference_geometry import BALLS, crooked_axes, rc1, rc3
@@ -45,14 +43,6 @@ def test_a_passive_deviation_is_a_residual_only_when_its_encoder_is_used() -> No
     np.testing.assert_allclose(residual[2], [0.4, 0.0, 0.0], atol=1e-8)
     shared = figure_residual_mm(positioners, q, pose_from_axes(positioners, q))
     assert np.abs(shared).max() == pytest.approx(0.4 * 0.6838, rel=0.02)
-
-
-def test_pairwise_residual_names_the_stretched_pair() -> None:
-    q = np.zeros(12)
-    q[3] = 0.25  # B.X away from A
-    gaps = pairwise_residual_mm(socket_positions(rc1(), q), BALLS)
-    assert gaps[0, 1] == pytest.approx(0.25)
-    assert gaps[2, 3] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_rows_that_fix_no_pose_are_refused() -> None:

@@ -8,19 +8,14 @@ from scipy.spatial.transform import Rotation
 
 from docking.geometry import (
     euler_to_matrix,
-    exp_se3,
     exp_so3,
-    interpolate,
-    log_se3,
     log_so3,
     matrix_to_euler,
-    orthonormal,
     pose_from_vector,
     pose_to_vector,
     rms,
     rotation_angle,
     skew,
-    wrap_angle,
 )
 from docking.types import Pose
 
@@ -73,17 +68,10 @@ def test_half_turns_about_every_axis() -> None:
 
 
 @given(vector, vector)
-def test_poses_and_twists(w: np.ndarray, v: np.ndarray) -> None:
-    twist = np.concatenate([3.0 * w / max(1.0, float(np.linalg.norm(w))), 1000.0 * v])
-    X = exp_se3(twist)
-    assert np.allclose(log_se3(X), twist, atol=1e-9)
+def test_a_pose_and_its_inverse_cancel(w: np.ndarray, v: np.ndarray) -> None:
+    X = Pose(exp_so3(3.0 * w / max(1.0, float(np.linalg.norm(w)))), 1000.0 * v)
     assert np.allclose((X @ X.inverse()).matrix(), np.eye(4), atol=1e-11)
     assert np.allclose(skew(w) @ v, np.cross(w, v))
-
-
-def test_a_screw_motion_moves_its_axis_along_itself() -> None:
-    X = exp_se3([0.0, 0.0, np.pi, 0.0, 0.0, 10.0])
-    assert np.allclose(X.apply([1.0, 2.0, 3.0]), [-1.0, -2.0, 13.0])
 
 
 @settings(max_examples=50)
@@ -96,21 +84,9 @@ def test_border_vector_is_in_mm_and_degrees(alpha: float, beta: float, gamma: fl
     assert np.allclose(pose_to_vector(X), v, atol=1e-7)
 
 
-def test_interpolation_keeps_the_pivot_on_a_line() -> None:
-    X0, X1 = pose_from_vector([0, 0, 0, 10, -20, 30]), pose_from_vector([100, 50, -20, 12, -25, 80])
-    pivot = np.array([4000.0, 0.0, 0.0])
-    assert np.allclose(interpolate(X0, X1, 0.0, pivot).matrix(), X0.matrix(), atol=1e-9)
-    assert np.allclose(interpolate(X0, X1, 1.0, pivot).matrix(), X1.matrix(), atol=1e-9)
-    for s in (0.25, 0.5, 0.9):
-        X = interpolate(X0, X1, s, pivot)
-        assert np.allclose(X.apply(pivot), (1 - s) * X0.apply(pivot) + s * X1.apply(pivot), atol=1e-9)
-        assert rotation_angle(X0.R.T @ X.R) == pytest.approx(s * rotation_angle(X0.R.T @ X1.R), abs=1e-12)
+def test_the_angle_of_a_rotation_is_never_negative() -> None:
+    assert rotation_angle(exp_so3([0.0, -0.3, 0.0])) == pytest.approx(0.3, abs=1e-15)
 
 
-def test_small_services() -> None:
-    assert wrap_angle(3 * np.pi) == pytest.approx(np.pi)
-    assert wrap_angle(-np.pi) == pytest.approx(np.pi)
+def test_rms_is_of_vectors_not_of_coordinates() -> None:
     assert rms([[3.0, 4.0, 0.0], [0.0, 0.0, 0.0]]) == pytest.approx(np.sqrt(12.5))
-    R = euler_to_matrix(0.1, 0.2, 0.3)
-    assert np.allclose(orthonormal(R + 1e-9), R, atol=1e-8)
-    assert np.allclose(Pose.from_matrix(Pose(R, np.ones(3)).matrix()).R, R)
