@@ -289,7 +289,9 @@ def load_truth(path: Path) -> TruthFile:
     """Read NAME.sim.toml. Raises FileUnreadable or ConfigInvalid (all problems at once)."""
     try:
         data = tomllib.loads(path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except OSError as error:
+        raise FileUnreadable(str(path), (error.strerror or str(error)).lower()) from error
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise FileUnreadable(str(path), str(error)) from error
     try:
         # JSON mode is strict about types yet takes arrays as tuples, which TOML cannot spell otherwise.

@@ -18,6 +18,7 @@ from tests.support.program import Terminal, quick_cell
 pytestmark = [pytest.mark.wires, pytest.mark.timeout(120)]
 
 AXIS = re.compile(r"([A-D]\.[XYZ]\*?)\s+([+-]\d+\.\d{3})")
+NAMES = re.compile(r"'[^']*'|[A-D]\.[XYZ]|(upper|lower)-(right|left)|\b(dx|dy|dz|mm|align|[synaghrW])\b")
 FEATURES = ("upper-right", "lower-right", "upper-left", "lower-left")
 
 
