@@ -151,6 +151,10 @@ class TickLate(MotionError):
     code = 2113
 
 
+class AxisNotEnabled(MotionError):
+    code = 2114
+
+
 # 3xxx measuring and fitting --------------------------------------------------------------------------------------
 class PoseError(DockingError):
     """Measuring and fitting. `rejected` holds what the screening had found out about single points when it refused."""
@@ -280,6 +284,10 @@ class BallSwivelExceeded(PlanError):
 class ToleranceUnprovable(PlanError):
     code = 5009
     exit_code = EXIT_OUT_OF_TOLERANCE
+
+
+class RiskTooHigh(ToleranceUnprovable):
+    code = 5011
 
 
 class PlanInputInvalid(PlanError):

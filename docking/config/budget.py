@@ -8,15 +8,18 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import linalg
 
 from docking.config.cell import CellFile
 from docking.config.job import Component, JobFile, Mate
 from docking.config.nominal import feature_points, mate_feature_points, target_points
 from docking.geometry import pose_from_vector
+from docking.pose.features import specific_risk
 from docking.pose.layout import spread
 from docking.pose.least_squares import design, weighted_centroid
 from docking.pose.noise import NOISE_PRESETS, NoiseModel
 from docking.pose.svd import fit_svd
+from docking.pose.uncertainty import largest_sigma_mm, own_cov_mm2
 from docking.types import Array, Pose
 
 REMEDIES = {
@@ -42,7 +45,7 @@ class FeatureBudget:
 
     @property
     def provable(self) -> bool:
-        """False when even an error of zero could not be accepted; NaN is not provable."""
+        """False when 2 sigma alone fill the tolerance; NaN is not provable. All features together: `least_risk`."""
         return 2.0 * self.sigma_mm <= self.tolerance_mm
 
     @property
@@ -72,27 +75,11 @@ def feature_budget(cell: CellFile, job: JobFile, passes: int) -> tuple[FeatureBu
 
     Raises numpy.linalg.LinAlgError when a target set does not define a pose.
     """
-    X_WC, X_WM = docked_pose(cell, job), pose_from_vector(job.mate.pose)
-    features = feature_points(job.component, cell)
-    mates = mate_feature_points(job.component, job.mate, cell)
-    at_W = X_WC.apply(features.xyz_mm)
-    component = _part_covs(_Readings.of(cell, job.component, X_WC, passes), at_W)
-    mate = _part_covs(_Readings.of(cell, job.mate, X_WM, passes), at_W)
-    drift_mm = cell.tracker.drift_um_per_h * 1e-3 * cell.limits.fit_age_s / 3600.0
-    covs = (
-        component[0],
-        mate[0],
-        component[1],
-        mate[1],
-        features.cov_mm2 + mates.cov_mm2,
-        np.broadcast_to(np.eye(3) * drift_mm**2, features.cov_mm2.shape),
-        component[2] + mate[2],
+    joint = _joint_covs(cell, job, passes)
+    total, each = (
+        largest_sigma_mm(own_cov_mm2(np.sum(joint, axis=0))),
+        [largest_sigma_mm(own_cov_mm2(cov)) for cov in joint],
     )
-    return _budgets(job, covs)
-
-
-def _budgets(job: JobFile, covs: tuple[Array, ...]) -> tuple[FeatureBudget, ...]:
-    total, each = _largest_sigma(np.sum(covs, axis=0)), [_largest_sigma(cov) for cov in covs]
     return tuple(
         FeatureBudget(
             feature.name,
@@ -101,6 +88,37 @@ def _budgets(job: JobFile, covs: tuple[Array, ...]) -> tuple[FeatureBudget, ...]
             tuple((name, float(sigma[i])) for name, sigma in zip(REMEDIES, each, strict=True)),
         )
         for i, feature in enumerate(job.component.features)
+    )
+
+
+def least_risk(cell: CellFile, job: JobFile, passes: int) -> float:
+    """Probability that any feature is out of tolerance when every measured error is zero, the least there can be.
+
+    The acceptance evaluates the same function on what was measured. Raises as `feature_budget`.
+    """
+    joint: Array = np.sum(_joint_covs(cell, job, passes), axis=0)
+    tolerance = np.array([feature.tolerance_mm for feature in job.component.features])
+    return specific_risk(np.zeros((len(tolerance), 3)), joint, tolerance)
+
+
+def _joint_covs(cell: CellFile, job: JobFile, passes: int) -> tuple[Array, ...]:
+    """Joint covariance (3f, 3f) of the errors of all features in W by each part, in the order of REMEDIES."""
+    X_WC, X_WM = docked_pose(cell, job), pose_from_vector(job.mate.pose)
+    features = feature_points(job.component, cell)
+    mates = mate_feature_points(job.component, job.mate, cell)
+    at_W = X_WC.apply(features.xyz_mm)
+    component = _part_covs(_Readings.of(cell, job.component, X_WC, passes), at_W)
+    mate = _part_covs(_Readings.of(cell, job.mate, X_WM, passes), at_W)
+    drift_mm = cell.tracker.drift_um_per_h * 1e-3 * cell.limits.fit_age_s / 3600.0
+    count = len(at_W)
+    return (
+        component[0],
+        mate[0],
+        component[1],
+        mate[1],
+        linalg.block_diag(*(features.cov_mm2 + mates.cov_mm2)),
+        drift_mm**2 * np.tile(np.eye(3), (count, count)),
+        component[2] + mate[2],
     )
 
 
@@ -124,7 +142,7 @@ class _Readings:
 
 
 def _part_covs(readings: _Readings, features_W_mm: Array) -> tuple[Array, Array, Array]:
-    """Covariances (f, 3, 3) that the fit of one part gives the features: by noise, by nominal nests, by temperature.
+    """Joint covariances (3f, 3f) that the fit of one part gives the features: by noise, nominal nests, temperature.
 
     The weighted fit [rotation, translation, expansion] has the gain G = P A^T S^-1, P = (A^T S^-1 A + L)^-1, with the
     prior L of the expansion alone; S = noise + nominal. Then P = G noise G^T + G nominal G^T + P L P.
@@ -141,12 +159,7 @@ def _part_covs(readings: _Readings, features_W_mm: Array) -> tuple[Array, Array,
     inverse = np.linalg.inv((weighted @ jac).sum(axis=0) + prior)
     gain = inverse @ weighted
     back = gain.transpose(0, 2, 1)
-    reach = design(features_W_mm, centre)[:, :, :free] * scale
+    reach = (design(features_W_mm, centre)[:, :, :free] * scale).reshape(-1, free)
     parts = ((gain @ readings.noise_mm2 @ back).sum(axis=0), (gain @ readings.nominal_mm2 @ back).sum(axis=0))
-    noise, nominal, thermal = (reach @ cov @ reach.transpose(0, 2, 1) for cov in (*parts, inverse @ prior @ inverse))
+    noise, nominal, thermal = (reach @ cov @ reach.T for cov in (*parts, inverse @ prior @ inverse))
     return noise, nominal, thermal
-
-
-def _largest_sigma(cov_mm2: Array) -> Array:
-    result: Array = np.sqrt(np.maximum(np.linalg.eigvalsh(cov_mm2)[:, -1], 0.0))
-    return result

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from docking.config.budget import feature_budget
+from docking.config.budget import feature_budget, least_risk
 from docking.config.cell import CellFile
 from docking.config.cross_check import check_cell, check_job
 from docking.config.describe import describe
@@ -55,6 +55,7 @@ class CheckResult:
                 }
                 for budget in feature_budget(self.cell, self.job, self.job.measuring.max_passes)
             ],
+            "expected_risk": least_risk(self.cell, self.job, self.job.measuring.max_passes),
             "warnings": [{"file": str(path), "key": f.key, "text": f.text} for path, f in self.warnings],
         }
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from docking.config.budget import docked_pose, feature_budget
+from docking.config.budget import docked_pose, feature_budget, least_risk
 from docking.config.build import load_from, positioners_from, rank_settings
 from docking.config.cell import CanBus, CellFile
 from docking.config.job import JobFile
@@ -12,6 +12,7 @@ from docking.config.support import stage_positions
 from docking.geometry import pose_to_vector
 from docking.kinematics import conditioning, reaction_extremes
 from docking.kinematics.forces import ball_reactions_n
+from docking.types import RISK_LIMIT
 
 
 def describe(cell: CellFile, job: JobFile) -> str:
@@ -80,7 +81,8 @@ def _stages(job: JobFile) -> list[str]:
 
 def _proof(cell: CellFile, job: JobFile) -> list[str]:
     measuring = job.measuring
-    budgets = zip(*(feature_budget(cell, job, n) for n in (measuring.passes, measuring.max_passes)), strict=True)
+    counts = measuring.passes, measuring.max_passes
+    budgets = zip(*(feature_budget(cell, job, n) for n in counts), strict=True)
     passes = f"{measuring.passes} / {measuring.max_passes}"
     rows = [f"feature           tolerance mm   2 sigma mm with {passes} passes   largest part"]
     for few, many in budgets:
@@ -89,4 +91,6 @@ def _proof(cell: CellFile, job: JobFile) -> list[str]:
             f"  {few.name:<16}{few.tolerance_mm:12g}{2.0 * few.sigma_mm:16.3f} / {2.0 * many.sigma_mm:.3f}"
             f"           {part} ({sigma:.3f} mm)"
         )
+    least = " / ".join(f"{least_risk(cell, job, n):.2%}" for n in counts)
+    rows.append(f"risk that a feature is out of tolerance when no error is measured: {least} (limit {RISK_LIMIT:.1%})")
     return rows

@@ -15,7 +15,14 @@ from math import degrees
 import numpy as np
 from numpy.typing import ArrayLike
 
-from docking.errors import CorrectionTooLarge, Diverging, IterationsExhausted, PlanError, ToleranceUnprovable
+from docking.errors import (
+    CorrectionTooLarge,
+    Diverging,
+    IterationsExhausted,
+    PlanError,
+    RiskTooHigh,
+    ToleranceUnprovable,
+)
 from docking.geometry import exp_so3, log_so3
 from docking.types import RISK_LIMIT, Array, Correction, FeatureErrors, Pose
 
@@ -142,11 +149,10 @@ def decide(history: Sequence[Attempt], settings: ConvergenceSettings, stage: str
     dead_band = min(settings.dead_band_mm, settings.dead_band_fraction * last.tolerance_mm)
     if last.error_mm < max(dead_band, last.sigma_mm) and last.passes < settings.max_passes:
         return verdict(Action.MEASURE_MORE, "the error is too small to move for, its sigma too large to accept")
-    bound = last.error_mm + 2.0 * last.sigma_mm
     if last.error_mm < dead_band:
-        risk = f"The risk that a feature is out of tolerance is {last.risk:.1%}, at most {RISK_LIMIT:.1%} is accepted."
-        unprovable = ToleranceUnprovable(stage, risk, value=bound, limit=last.tolerance_mm)
-        return verdict(Action.OUT_OF_TOLERANCE, "inside the dead-band, and all passes are spent", unprovable)
+        return verdict(
+            Action.OUT_OF_TOLERANCE, "inside the dead-band, and all passes are spent", _unprovable(last, stage)
+        )
     before = _error_before_worse_twice(history)
     if before is not None:
         return verdict(Action.ABORT, "worse twice", Diverging(stage, value=last.error_mm, limit=before))
@@ -154,6 +160,14 @@ def decide(history: Sequence[Attempt], settings: ConvergenceSettings, stage: str
         exhausted = IterationsExhausted(stage, value=last.corrections, limit=settings.max_corrections)
         return verdict(Action.OUT_OF_TOLERANCE, "corrections are spent", exhausted)
     return verdict(Action.MOVE, "a correction is worth making")
+
+
+def _unprovable(last: Attempt, stage: str) -> PlanError:
+    """Why an error too small to move for is not accepted: its own bound, else the risk of all features together."""
+    bound = last.error_mm + 2.0 * last.sigma_mm
+    if not (bound <= last.tolerance_mm):
+        return ToleranceUnprovable(stage, value=bound, limit=last.tolerance_mm)
+    return RiskTooHigh(stage, value=100.0 * last.risk, limit=100.0 * RISK_LIMIT)
 
 
 def _error_before_worse_twice(history: Sequence[Attempt]) -> float | None:

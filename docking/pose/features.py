@@ -110,11 +110,11 @@ def specific_risk(error_mm: Array, joint_mm2: Array, tolerance_mm: Array) -> flo
     """Probability that any feature is out of its tolerance, given what was measured (specific risk, JCGM 106).
 
     `error_mm` (n, 3), `joint_mm2` (3n, 3n) the covariance of all errors together, `tolerance_mm` (n,). From fixed
-    draws: the same data give the same number.
+    draws through the symmetric root, which has no jumps: nearly the same data give nearly the same number.
     """
     values, vectors = np.linalg.eigh(joint_mm2)
     draws = np.random.default_rng(_RISK_SEED).standard_normal((_RISK_DRAWS, len(joint_mm2)))
-    off = draws @ (vectors * np.sqrt(np.maximum(values, 0.0))).T + error_mm.reshape(-1)
+    off = draws @ (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T + error_mm.reshape(-1)
     outside = np.linalg.norm(off.reshape(_RISK_DRAWS, -1, 3), axis=2) > tolerance_mm
     return float(np.mean(np.any(outside, axis=1)))
 

@@ -260,6 +260,10 @@ JOB_CASES = {
         put("component.features.1.tolerance_mm", 0.01),
         ["component.features[1].tolerance_mm", "0.01 mm", "lower-right", "2 sigma = 0.0275", "largest part"],
     ),
+    "risk too high though 2 sigma fit": (
+        lambda doc: [feature.update(tolerance_mm=0.034) for feature in doc["component"]["features"]],
+        ["component.features[1].tolerance_mm", "lower-right", "no error measured", "tolerance is 1", "at most 2.5%"],
+    ),
     "nan": (put("component.com_mm.2", math.nan), ["component.com_mm[2] = NaN", "finite"]),
     "unknown key": (put("component.massa_kg", 60.0), ["component.massa_kg = 60", "nearest valid key: mass_kg"]),
     "no features": (drop("component.features"), ["component.features: missing"]),

@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy.stats import chi2
 
 from docking.config import CellFile, JobFile
-from docking.config.budget import docked_pose, feature_budget, noise_of
+from docking.config.budget import docked_pose, feature_budget, least_risk, noise_of
 from docking.config.job import Component, Mate
 from docking.config.load import default_job_path, load_cell, load_job
 from docking.config.nominal import feature_points, mate_feature_points, target_points
@@ -45,9 +46,18 @@ def drawn(cov: Array, rng: np.random.Generator) -> Array:
     return np.einsum("nij,nj->ni", np.linalg.cholesky(cov), rng.normal(size=(len(cov), 3)))
 
 
+def tightened(job: JobFile, sigmas: float, cell: CellFile) -> JobFile:
+    """The job with every tolerance at so many of its feature's sigmas."""
+    budgets = feature_budget(cell, job, PASSES)
+    parts = zip(job.component.features, budgets, strict=True)
+    narrow = tuple(f.model_copy(update={"tolerance_mm": sigmas * b.sigma_mm}) for f, b in parts)
+    return job.model_copy(update={"component": job.component.model_copy(update={"features": narrow})})
+
+
 @pytest.mark.parametrize("name", ["fuselage-can", "wing-modbus", "lab-can"])
-def test_expected_sigma_is_the_one_a_fit_will_state(name: str) -> None:
+def test_expected_sigma_and_risk_are_those_a_fit_will_state(name: str) -> None:
     cell, job = load(name)
+    job = tightened(job, 2.5, cell)
     parts = job.component.features
     features = Features(
         tuple(f.name for f in parts),
@@ -64,6 +74,18 @@ def test_expected_sigma_is_the_one_a_fit_will_state(name: str) -> None:
     assert_allclose(stated.norm_mm, 0.0, atol=1e-9)
     expected = [b.sigma_mm for b in feature_budget(cell, job, PASSES)]
     assert_allclose(expected, stated.sigma_mm, rtol=1e-6)
+    assert 0.01 < stated.risk < 0.3
+    assert least_risk(cell, job, PASSES) == pytest.approx(stated.risk, abs=2e-4)
+
+
+def test_the_least_risk_counts_three_directions_and_all_features() -> None:
+    """Features that err alone and alike in three directions: 1 - P(chi2_3 <= k^2)^f, far over the 4.6 % of one."""
+    cell, job = load("lab-can")
+    alone = tuple(f.model_copy(update={"sigma_mm": 5.0, "mate_sigma_mm": 5.0}) for f in job.component.features)
+    job = job.model_copy(update={"component": job.component.model_copy(update={"features": alone})})
+    expected = 1.0 - chi2(3).cdf(2.5**2) ** len(alone)
+    assert least_risk(cell, tightened(job, 2.5, cell), PASSES) == pytest.approx(expected, abs=0.02)
+    assert least_risk(cell, tightened(job, 6.0, cell), PASSES) == 0.0
 
 
 def test_expected_sigma_is_the_scatter_of_drawn_errors() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,6 +14,7 @@ from docking.errors import (
     CorrectionTooLarge,
     Diverging,
     IterationsExhausted,
+    RiskTooHigh,
     ToleranceUnprovable,
 )
 from docking.planning import (
@@ -134,6 +137,21 @@ def test_each_end_has_its_own_error() -> None:
     assert isinstance(decide(worse, SETTINGS).error, Diverging)
     assert isinstance(decide(spent, SETTINGS).error, IterationsExhausted)
     assert isinstance(decide([look(0.04, 0.09, passes=6)], SETTINGS).error, ToleranceUnprovable)
+
+
+def test_a_refusal_on_risk_alone_gives_the_risk_and_its_limit() -> None:
+    inside = replace(look(0.02, 0.05, tolerance=0.2, passes=6), accepted=False, risk=0.031)
+    error = decide([inside], SETTINGS).error
+    assert isinstance(error, RiskTooHigh)
+    assert error.value == pytest.approx(3.1)
+    assert error.limit == pytest.approx(2.5)
+    assert "3.1 %" in error.text()
+    assert "3.1 %" in error.text("zh")
+    assert error.exit_code == 3
+    wide = decide([look(0.04, 0.09, passes=6)], SETTINGS).error
+    assert isinstance(wide, ToleranceUnprovable)
+    assert not isinstance(wide, RiskTooHigh)
+    assert (wide.value, wide.limit) == (pytest.approx(0.22), 0.2)
 
 
 def test_the_dead_band_is_a_quarter_of_a_tight_tolerance() -> None:
