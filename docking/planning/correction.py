@@ -167,7 +167,7 @@ def _unprovable(last: Attempt, stage: str) -> PlanError:
     bound = last.error_mm + 2.0 * last.sigma_mm
     if not (bound <= last.tolerance_mm):
         return ToleranceUnprovable(stage, value=bound, limit=last.tolerance_mm)
-    return RiskTooHigh(stage, value=100.0 * last.risk, limit=100.0 * RISK_LIMIT)
+    return RiskTooHigh(stage, value=round(100.0 * last.risk, 2), limit=100.0 * RISK_LIMIT)
 
 
 def _error_before_worse_twice(history: Sequence[Attempt]) -> float | None:
