@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from docking.report.run import Body, Move, Record, Run
 from docking.report.words import number, plain
+from docking.types import RISK_LIMIT
 
 Row = dict[str, Any]
 
@@ -53,8 +54,12 @@ def by_letter(limits: dict[str, Any]) -> Row:
 
 
 def feature_rows(body: Body) -> list[Row]:
-    """One row a feature of a `features` record; `inside` is e + 2 sigma <= tolerance and fails on unknown numbers."""
-    rows = []
+    """One row a feature of a `features` record.
+
+    `within` is e + 2 sigma <= tolerance; `inside` asks for the risk of all features together too. Both fail on unknown
+    numbers.
+    """
+    rows, risk_holds = [], risk_row(body)["holds"]
     for i, name in enumerate(body.get("names") or ()):
         vector = at(body.get("error_mm"), i) or [None] * 3
         e, sigma = length(vector), numeric(at(body.get("sigma_mm"), i))
@@ -68,35 +73,51 @@ def feature_rows(body: Body) -> list[Row]:
                 "e2s_mm": e + 2.0 * sigma,
                 "tolerance_mm": tolerance,
                 "margin_mm": tolerance - e - 2.0 * sigma,
-                "inside": e + 2.0 * sigma <= tolerance,
+                "within": e + 2.0 * sigma <= tolerance,
+                "inside": risk_holds and e + 2.0 * sigma <= tolerance,
             }
         )
     return rows
 
 
+def risk_row(body: Body) -> Row:
+    """The other half of the acceptance rule: the risk of a `features` record and its limit, in percent."""
+    risk = numeric(body.get("risk"))
+    return {"percent": 100.0 * risk, "limit_percent": 100.0 * RISK_LIMIT, "holds": risk <= RISK_LIMIT}
+
+
 def stage_rows(run: Run) -> list[Row]:
-    """For each stage in order: every feature before its first and after its last move.
+    """For each stage in order: every feature before its first and after its last move, with the risk of all and
+    whether the last judgement meets the acceptance rule (None where there was none).
 
     A stage that was entered from the one before was last judged there, against a goal that differs by the stand-off
     only: that judgement is its "before".
     """
-    stages: dict[str, dict[str, list[Row]]] = {}
-    newest: list[Row] = []
+    stages: dict[str, dict[str, Body]] = {}
+    newest: Body = {}
     for body in run.bodies("features"):
         stage = stages.setdefault(str(body.get("stage")), {"earlier": newest})
-        newest = feature_rows(body)
+        newest = body
         if body.get("when") == "before":
-            stage.setdefault("before", newest)
+            stage.setdefault("before", body)
         else:
-            stage["after"] = newest
-    return [{"stage": name, "rows": _paired(stage)} for name, stage in stages.items()]
+            stage["after"] = body
+    return [
+        _stage_row(name, stage.get("before", stage["earlier"]), stage.get("after", {}))
+        for name, stage in stages.items()
+    ]
 
 
-def _paired(stage: dict[str, list[Row]]) -> list[Row]:
-    before = {row["name"]: row for row in stage.get("before", stage["earlier"])}
-    after = {row["name"]: row for row in stage.get("after", ())}
-    names = dict.fromkeys([*before, *after])
-    return [{"name": name, "before": before.get(name), "after": after.get(name)} for name in names]
+def _stage_row(name: str, before: Body, after: Body) -> Row:
+    sides = [{row["name"]: row for row in feature_rows(body)} for body in (before, after)]
+    names = dict.fromkeys([*sides[0], *sides[1]])
+    judged = list(sides[1].values())
+    return {
+        "stage": name,
+        "rows": [{"name": n, "before": sides[0].get(n), "after": sides[1].get(n)} for n in names],
+        "risks": [risk_row(before), risk_row(after)],
+        "meets": all(row["inside"] for row in judged) if judged else None,
+    }
 
 
 def check_rows(body: Body) -> list[Row]:
@@ -109,6 +130,19 @@ def check_rows(body: Body) -> list[Row]:
         agrees = None if math.isnan(limit) and not math.isnan(e) else e <= limit
         rows.append({"name": name, "e_mm": e, "limit_mm": limit, "agrees": agrees})
     return rows
+
+
+def measured_rows(run: Run) -> list[Row]:
+    """One row a docking feature that was measured: NAME.C of the component, NAME.M of the mate, against the job."""
+    return [row for body in run.bodies("features_measured") for row in check_rows(body)]
+
+
+def set_aside_rows(run: Run) -> list[Row]:
+    """Every check point that was set aside because it alone was grossly off."""
+    keys = "name", "error_mm", "limit_mm"
+    return [
+        {"age_s": run.age_s(record), **{key: record["body"].get(key) for key in keys}} for record in run.of("set_aside")
+    ]
 
 
 def fit_rows(run: Run) -> list[Row]:
@@ -253,8 +287,9 @@ def end_difference(move: Move) -> float:
     )
 
 
-def maxima_rows(moves: list[Move]) -> list[Row]:
-    """One row an executed move: its largest following error (and axis), residual and internal force."""
+def maxima_rows(moves: list[Move], run_limits: dict[str, Any]) -> list[Row]:
+    """One row an executed move: its largest following error (and axis), residual, predicted internal force, and the
+    measured axis force nearest to its limit in `run_limits` (N by axis)."""
     rows = []
     for move in moves:
         errors = move.moved.get("max_following_error_mm") or {}
@@ -269,9 +304,19 @@ def maxima_rows(moves: list[Move]) -> list[Row]:
                 "axis": worst or "",
                 "residual_mm": move.moved.get("max_consistency_residual_mm"),
                 "force_n": move.moved.get("max_internal_force_n"),
+                **_nearest_force(move, run_limits),
             }
         )
     return rows
+
+
+def _nearest_force(move: Move, limits: dict[str, Any]) -> Row:
+    """The measured force along an axis that came nearest to that axis's limit, with both; NaN where none is known."""
+    tracks = (move.moved.get("trace") or {}).get("force_n") or {}
+    found = [(largest(track), numeric(limits.get(axis)), axis) for axis, track in tracks.items()]
+    known = [item for item in found if not math.isnan(item[0] / item[1])]
+    force, limit, axis = max(known, key=lambda item: item[0] / item[1], default=(math.nan, math.nan, ""))
+    return {"axis_force_n": force, "axis_limit_n": limit, "force_axis": axis}
 
 
 def event_rows(run: Run, words: dict[str, str]) -> list[Row]:
@@ -282,9 +327,15 @@ def event_rows(run: Run, words: dict[str, str]) -> list[Row]:
         if template is None:
             continue
         body = {key: plain(value) for key, value in record["body"].items() if not isinstance(value, dict | list)}
+        lists = {key: value for key, value in record["body"].items() if isinstance(value, list)}
+        body |= {key: ", ".join(value) or words["none"] for key, value in lists.items() if _are_words(value)}
         body["plan"] = plain(record["body"].get("plan_hash"))[:8]
         rows.append({"age_s": run.age_s(record), "seq": record["seq"], "text": _filled(template, body, words)})
     return rows
+
+
+def _are_words(values: list[Any]) -> bool:
+    return all(isinstance(value, str) for value in values)
 
 
 def _event_key(record: Record) -> str:

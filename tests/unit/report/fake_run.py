@@ -58,7 +58,12 @@ class FakeRun:
             tolerance_mm=TOLERANCE_MM,
             decision_rule="ISO 14253-1, k = 2",
             axes=list(AXES),
-            limits={"following_error_mm": 0.5, "ball_residual_mm": 0.1, "internal_force_n": 1500.0},
+            limits={
+                "following_error_mm": 0.5,
+                "ball_residual_mm": 0.1,
+                "internal_force_n": 1500.0,
+                "axis_force_n": dict(zip(AXES, [5000.0, 5000.0, 30000.0] * 4, strict=True)),
+            },
         )
         self.go("load", "standby")
         self.add("identity", where="tracker", vendor="line", product="LT-40", serial="77120", firmware="3.2")
@@ -135,6 +140,7 @@ class FakeRun:
             * self.rng.uniform(0.6, 1.0, (len(FEATURES), 1))
         )
         norm = np.linalg.norm(error, axis=1)
+        risk = 0.0042 if size_mm < 0.12 else 0.98
         self.add(
             "features",
             stage=stage,
@@ -144,7 +150,8 @@ class FakeRun:
             norm_mm=norm,
             sigma_mm=[sigma_mm] * len(FEATURES),
             tolerance_mm=[TOLERANCE_MM] * len(FEATURES),
-            accepted=bool(np.all(norm + 2 * sigma_mm <= TOLERANCE_MM)),
+            risk=risk,
+            accepted=bool(np.all(norm + 2 * sigma_mm <= TOLERANCE_MM) and risk <= 0.025),
         )
 
     def move(self, stage: str, size_mm: float, result: str = "done", share: float = 1.0) -> str:
@@ -172,6 +179,7 @@ class FakeRun:
             },
         )
         self.go("planned", "confirm")
+        self.add("permissives", stage=stage, declared=["area_clear", "reflectors_off"], missing=[])
         self.add("confirm", 4.0, plan_hash=plan_hash, go=True)
         goal = self.q_mm + delta
         self.add(
@@ -254,6 +262,10 @@ def docked_run(part_number: str = "FUS-15-2200", simulated: bool = True) -> Fake
     run.start()
     run.station()
     run.go("frame-measured", "measure")
+    run.add("set_aside", name="K3", error_mm=2.716, limit_mm=0.118)
+    for side, off_mm in (("C", 0.0213), ("M", 0.0457)):
+        names = [f"{name}.{side}" for name in FEATURES]
+        run.add("features_measured", names=names, error_mm=[off_mm] * 4, limit_mm=[0.081] * 4)
     for i, (stage, size_mm) in enumerate(STAGES):
         run.look(stage, "before", size_mm, rejected=("T7",) if i == 0 else ())
         run.move(stage, max(size_mm, (300.0, 200.0, 70.0, 20.0, 10.0)[i] * 0.3))

@@ -142,6 +142,38 @@ def test_stage_table_shows_the_first_before_and_the_last_after(tmp_path: Path) -
     assert cells[5] == f"{judged[2]['norm_mm'][0] + 2 * judged[2]['sigma_mm'][0]:.3f}"
 
 
+@pytest.mark.usefixtures("no_pictures")
+def test_a_run_refused_on_risk_shows_no_feature_as_inside(tmp_path: Path) -> None:
+    run = docked_run()
+    for _, kind, body in run.events:
+        if kind == "features":
+            body["risk"] = 0.031
+    text = html(records(run, tmp_path))
+    shown = Page(text).text
+    assert "3.10 %" in shown
+    assert "over its limit" in shown
+    assert "✓ proved inside" not in shown
+    assert "risk too high" in shown
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_points_kept_out_of_the_fits_are_shown(tmp_path: Path) -> None:
+    text = Page(html(records(docked_run(), tmp_path))).text
+    for told in ("F2.C 0.021 0.081 ✓ agrees", "F2.M 0.046 0.081 ✓ agrees", "K3 2.716 0.118"):
+        assert told in text
+    assert "given area_clear, reflectors_off; not given none" in text
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_risk_stands_beside_every_stage(tmp_path: Path) -> None:
+    text = html(records(docked_run(), tmp_path))
+    rows = re.findall(r'<tr class="first">(.*?)</tr>', text)
+    risks = [re.findall(r'<td rowspan="4">([^<]*)</td>', row) for row in rows]
+    assert [r for r in risks if r][-1] == ["98.00", "0.42"]
+    assert "✓ yes" in rows[len(risks) - 1]
+    assert "0.42 %" in Page(text).text
+
+
 def test_every_picture_is_there(docked_page: str) -> None:
     assert docked_page.count("<svg") == docked_page.count("<figure>") == 8
     for word in ("Δ position", "following error", "consistency residual", "internal force", "limit 0.1 mm"):

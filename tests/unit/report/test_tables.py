@@ -15,9 +15,11 @@ from docking.report.tables import (
     displacement_blocks,
     end_difference,
     feature_rows,
+    maxima_rows,
     natural,
     plan_rows,
     pose_of,
+    risk_row,
     stage_rows,
 )
 from docking.report.traces import envelope, track
@@ -30,6 +32,7 @@ def test_a_feature_is_inside_up_to_its_tolerance_and_no_further() -> None:
         "error_mm": [[0.06, 0.08, 0.0], [0.0, 0.0, -0.1], [0.0, 0.0, 0.0]],
         "sigma_mm": [0.05, 0.0501, None],
         "tolerance_mm": [0.2, 0.2, 0.2],
+        "risk": 0.025,
     }
     at, over, unknown = feature_rows(body)
     assert at["e_mm"] == pytest.approx(0.1)
@@ -38,6 +41,19 @@ def test_a_feature_is_inside_up_to_its_tolerance_and_no_further() -> None:
     assert over["margin_mm"] == pytest.approx(-0.0002)
     assert not over["inside"]
     assert not unknown["inside"]
+
+
+@pytest.mark.parametrize("risk", [0.0251, None, float("nan")])
+def test_no_feature_is_inside_where_the_risk_of_all_is_too_high_or_unknown(risk: float | None) -> None:
+    body = {"names": ["F"], "error_mm": [[0.01, 0, 0]], "sigma_mm": [0.05], "tolerance_mm": [0.2], "risk": risk}
+    (row,) = feature_rows(body)
+    assert row["within"]
+    assert not row["inside"]
+    assert not risk_row(body)["holds"]
+
+
+def test_risk_is_told_in_percent() -> None:
+    assert risk_row({"risk": 0.0123}) == {"percent": pytest.approx(1.23), "limit_percent": 2.5, "holds": True}
 
 
 def test_a_check_point_with_an_unknown_error_disagrees() -> None:
@@ -53,6 +69,7 @@ def test_a_stage_begins_with_the_last_judgement_before_it() -> None:
 
     stages = [("a", "before", 9.0), ("a", "after", 5.0), ("a", "after", 4.0), ("b", "after", 2.0)]
     run = Run([judged(*row) for row in stages])
+    assert [s["meets"] for s in stage_rows(run)] == [False, False]
     shown = [(s["stage"], s["rows"][0]["before"]["e_mm"], s["rows"][0]["after"]["e_mm"]) for s in stage_rows(run)]
     assert shown == [("a", 9.0, 4.0), ("b", 4.0, 2.0)]
 
@@ -82,6 +99,15 @@ def test_end_difference_compares_read_back_with_plan() -> None:
     assert end_difference(made_move(1, [100.0, 102.0, 104.75])) == pytest.approx(0.25)
     assert math.isnan(end_difference(made_move(1, [100.0, 102.0, 104.0], finished=False)))
     assert math.isnan(end_difference(Move(1, {}, {})))
+
+
+def test_the_measured_force_nearest_to_its_limit_is_shown() -> None:
+    forces = {"A.X": [10.0, -45.0, 20.0], "A.Z": [400.0, 380.0, None], "B.Z": [None, None, None]}
+    move = Move(1, {}, {"trace": {"force_n": forces}})
+    (row,) = maxima_rows([move], {"A.X": 50.0, "A.Z": 1000.0, "B.Z": 1.0})
+    assert (row["axis_force_n"], row["axis_limit_n"], row["force_axis"]) == (45.0, 50.0, "A.X")
+    (unknown,) = maxima_rows([Move(1, {}, {})], {})
+    assert math.isnan(unknown["axis_force_n"])
 
 
 def test_displacements_come_in_blocks_that_fit_the_page() -> None:
