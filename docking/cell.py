@@ -14,6 +14,9 @@ OPENING = {State.STANDBY: Event.CONNECT, State.DISABLED: Event.ENABLE, State.IDL
 REQUESTS = {Effect.HOLD: "hold", Effect.RESUME: "resume", Effect.STOP: "stop"}
 """Effects that only tell the running move something."""
 
+SLOWING = (Effect.HOLD, Effect.STOP)
+"""Requests that are passed on before they are recorded; what sets axes moving is recorded first."""
+
 TOLD = {Effect.HOLD: "paused", Effect.RESUME: "resumed", Effect.STOP: "stopping"}
 """What the operator hears of them."""
 
@@ -59,6 +62,10 @@ class Cell:
         except EventRefused as refusal:
             self.procedure.operator.notify("refused_event", error=refusal)
             return
+        # What slows the axes down is asked for first: neither a slow disk nor a slow terminal lengthens a stop.
+        for effect in effects:
+            if effect in SLOWING:
+                self._tell(effect)
         body = {"from": before.value, "event": event.value, "to": self.situation.state.value}
         self.procedure.journal.write("state", body)
         if error is not None:
@@ -74,9 +81,13 @@ class Cell:
             return
         self.procedure.journal.write("command", {"verb": verb})
         self.procedure.operator.notify(TOLD[effect])
-        # A move that has just ended takes no more requests: one kept for later would hold or stop the next move.
+        if effect not in SLOWING:
+            self._tell(effect)
+
+    def _tell(self, effect: Effect) -> None:
+        """A move that has just ended takes no more requests: one kept for later would hold or stop the next move."""
         if self._activity is not None and not self._activity.done():
-            self.procedure.motion.request(verb)
+            self.procedure.motion.request(REQUESTS[effect])
 
     def _ended(self, activity: asyncio.Task[None]) -> None:
         """A defect (an error that is not the cell's own) ends the run as a fault; nothing may wait for it for ever."""

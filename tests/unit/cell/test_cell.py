@@ -110,6 +110,46 @@ def test_a_hold_reaches_the_motion_side_during_the_move(late_s):
     assert ("command", {"verb": "hold"}) in parts.records
 
 
+@pytest.mark.parametrize(("event", "verb"), [(Event.HOLD, "hold"), (Event.ABORT, "stop"), (Event.RESUME, "resume")])
+def test_what_slows_the_axes_is_asked_for_before_it_is_written_and_what_moves_them_after(event, verb):
+    async def moving() -> Event:
+        await asyncio.sleep(3.0)
+        return Event.STOPPED if verb == "stop" else Event.MOVED
+
+    order: list[str] = []
+    parts = Everything(moves=1, MOVE=moving)
+    write, notify, request = parts.write, parts.notify, parts.request
+    parts.write = lambda kind, body, **how: (
+        order.append(f"write {body.get('verb', body.get('event'))}"),
+        write(kind, body),
+    )
+    parts.notify = lambda key, **facts: (order.append(f"notify {key}"), notify(key, **facts))
+    parts.request = lambda asked: (order.append(f"request {asked}"), request(asked))
+    first = [(MOVE_AT_S + 0.5, Event.HOLD)] if verb == "resume" else []
+    dock(parts, *first, (MOVE_AT_S + 1.0, event))
+    at = order.index(f"request {verb}")
+    state, command = (
+        order.index(f"write {event.value}"),
+        order.index(f"write {verb}", order.index(f"write {event.value}")),
+    )
+    if verb == "resume":
+        assert max(state, command) < at
+    else:
+        assert at < min(state, command)
+
+
+def test_a_journal_that_fails_does_not_keep_a_hold_from_the_axes():
+    def write(kind: str, body: dict, *, durable: bool = False) -> None:
+        if body.get("event") == Event.HOLD.value:
+            raise OSError("the disk is full")
+
+    parts = Everything()
+    parts.write = write
+    with pytest.raises(OSError, match="full"):
+        dock(parts, (MOVE_AT_S + 0.5, Event.HOLD))
+    assert [verb for _, verb in parts.requests] == ["hold"]
+
+
 def test_a_hold_directly_behind_the_confirmation_is_not_lost():
     async def confirm_and_hold() -> Event:
         cells[0].post(Event.CONFIRMED)
