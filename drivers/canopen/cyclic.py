@@ -19,6 +19,8 @@ from drivers.maps.objects import ObjectMap
 _INT32_MAX = 2147483647.0
 _FRAME = codec.SET_POINT.itemsize
 _NEVER = -1_000_000
+FORCE_PERIODS = 3
+"""Periods of the load-cell frames after which a force that was not repeated is forgotten."""
 _NAN = float("nan")
 
 
@@ -57,12 +59,16 @@ class CyclicImage:
         self._force_index = {self._map.pdos["force"].cob + n.node: n.index for n in self.nodes if n.load_cell}
         self._raw: list[bytes] = [bytes(codec.READ_BACK.itemsize)] * count
         self._gathered: dict[int, bytes] = {}
+        self._gathered_cycle, self._gathered_cob = _NEVER, 0
         self._joined: bytes | None = None
-        self._batch: list[CanFrame] | None = None
+        self._head: list[CanFrame] | None = None
         self._decoded = b""
         self._seen = [_NEVER] * count
         self._force = np.full(count, np.nan)
         self._force_cycle = _NEVER
+        self._force_seen = dict.fromkeys(self._force_index.values(), 0)
+        self._force_lasts = FORCE_PERIODS * self._map.pdos["force"].transmission
+        self._force_due = self._force_lasts
         self._words: list[int] = [0] * count
         self._states: tuple[DriveState, ...] = (DriveState.UNKNOWN,) * count
         self._axis_states: tuple[AxisState, ...] = (AxisState.UNKNOWN,) * count
@@ -133,29 +139,31 @@ class CyclicImage:
     def take_batch(self, batch: list[CanFrame]) -> Sequence[CanFrame]:
         """Take the read-backs out of a batch; return the frames that are something else."""
         count = len(self._cobs)
-        # The very list of the last cycle, unaltered by agreement, need not be read twice.
-        if batch is self._batch:
-            self._seen = [self.cycles] * count
-            return ()
         head = batch[:count]
-        if [frame[0] for frame in head] == self._cobs:
-            raw = [frame[1] for frame in head]
-            joined = b"".join(raw)
-            if len(joined) == count * 8:
-                self._raw, self._joined, self._batch = raw, joined, None
-                self._seen = [self.cycles] * count
-                if len(batch) == count:
-                    self._batch = batch
-                    return ()
-                batch = batch[count:]
+        # At rest all nodes say what they said a cycle ago: the same frames need not be taken apart again.
+        if head == self._head or self._take_all(head):
+            self._seen = [self.cycles] * count
+            self._gathered.clear()
+            if len(batch) == count:
+                return ()
+            batch = batch[count:]
         return [frame for frame in batch if not self._take(frame)]
+
+    def _take_all(self, head: list[CanFrame]) -> bool:
+        """Take one whole set of read-backs in the order of the axes; False when `head` is something else."""
+        if [frame[0] for frame in head] != self._cobs:
+            return False
+        raw = [frame[1] for frame in head]
+        if any(len(data) != codec.READ_BACK.itemsize for data in raw):
+            return False
+        self._raw, self._joined, self._head = raw, b"".join(raw), head
+        return True
 
     def _take(self, frame: CanFrame) -> bool:
         cob, data = frame
         index = self._index.get(cob)
-        if index is not None and len(data) == 8:
-            self._raw[index], self._joined, self._batch = data, None, None
-            self._seen[index] = self.cycles
+        if index is not None and len(data) == codec.READ_BACK.itemsize:
+            self._gather(cob, data)
             return True
         index = self._force_index.get(cob)
         if index is not None and len(data) == 2:
@@ -163,17 +171,24 @@ class CyclicImage:
                 # A new array a cycle: an earlier feedback keeps the one it was given.
                 self._force, self._force_cycle = self._force.copy(), self.cycles
             self._force[index] = int.from_bytes(data, "little", signed=True) * self._map.newton_per_count
+            self._force_seen[index] = self.cycles
             return True
         return False
 
-    def _gather(self, index: int, data: bytes) -> None:
+    def _gather(self, cob: int, data: bytes) -> None:
         """Keep a read-back until those of the same SYNC are here, or the next SYNC's begin.
 
-        Positions of different instants would make a moving figure look strained.
+        Positions of different instants would make a moving figure look strained. A set is as old as its first frame.
+        What the host hears of a set only after the next SYNC comes in the order of the bus, lowest identifier first: a
+        lower one than the last begins the next set, or sets that lost frames would stay mixed for ever.
         """
-        if index in self._gathered:
+        index = self._index[cob]
+        syncs = self.cycles - self._gathered_cycle
+        if self._gathered and (index in self._gathered or syncs > 1 or (syncs and cob < self._gathered_cob)):
             self._pass_on()
-        self._gathered[index] = data
+        if not self._gathered:
+            self._gathered_cycle = self.cycles
+        self._gathered[index], self._gathered_cob = data, cob
         if len(self._gathered) == len(self._cobs):
             self._pass_on()
 
@@ -181,15 +196,15 @@ class CyclicImage:
         raw = list(self._raw)
         for index, data in self._gathered.items():
             raw[index] = data
-            self._seen[index] = self.cycles
-        self._raw, self._joined = raw, None
+            self._seen[index] = self._gathered_cycle
+        self._raw, self._joined, self._head = raw, None, None
         self._gathered.clear()
 
     def seed(self, index: int, statusword: int, position_counts: int) -> None:
         """Start from values read by SDO, before the first read-back frame: the axis is to stay where it stands."""
         data = np.array([(statusword, position_counts, 0)], codec.READ_BACK).tobytes()
         self._raw = [*self._raw[:index], data, *self._raw[index + 1 :]]
-        self._joined = self._batch = None
+        self._joined = self._head = None
         if index in self._slots:
             self._target[self._slots[index]] = position_counts
             # A dead controller may have left the axis under torque: the first controlword must not take it away.
@@ -213,6 +228,22 @@ class CyclicImage:
     def age_cycles(self, index: int) -> int:
         return self.cycles - self._seen[index]
 
+    def lacks_force(self, index: int) -> bool:
+        """True for an axis with a load cell whose force is not known, or was last heard too long ago."""
+        self._forget_old_forces()
+        return index in self._force_seen and bool(np.isnan(self._force[index]))
+
+    def _forget_old_forces(self) -> None:
+        """A force that nobody has repeated is no force: NaN."""
+        if not (self.cycles > self._force_due):
+            return
+        old = [i for i, seen in self._force_seen.items() if self.cycles - seen > self._force_lasts]
+        if not np.isnan(self._force[old]).all():
+            self._force = self._force.copy()
+            self._force[old] = np.nan
+        fresh = [seen for i, seen in self._force_seen.items() if i not in old]
+        self._force_due = min(fresh, default=self.cycles) + self._force_lasts
+
     def _decode(self) -> None:
         raw = self._joined if self._joined is not None else b"".join(self._raw)
         self._joined = raw
@@ -233,8 +264,9 @@ class CyclicImage:
             self._enabled = np.array([self._axis_states[i] is AxisState.ENABLED for i in self.driven])
 
     def feedback(self, t_s: float, watch: NodeWatch) -> Feedback:
-        """The newest read-back; `t_s` is the time of the SYNC that sampled it."""
+        """The newest read-back; `t_s` is the time of the last SYNC, of which an axis of age 0 has answered."""
         self._decode()
+        self._forget_old_forces()
         ages = self._fresh
         if min(self._seen) != self.cycles:
             ages = self.cycles - np.array(self._seen, dtype=np.float64)

@@ -176,7 +176,7 @@ class CanopenPositioners:
         return tuple(result for result in results if isinstance(result, Identity))
 
     async def _all_reporting(self) -> None:
-        """Wait until every node's read-back is fresh and its heartbeat alive. Raises DeviceSilent."""
+        """Wait until every node's read-back is fresh, its heartbeat alive, its force known. Raises DeviceSilent."""
         deadline = self._loop.time() + _START_UP_S + 3.0 * self._bus.heartbeat_s
         first = self._image.cycles + 2
         while True:
@@ -184,6 +184,7 @@ class CanopenPositioners:
             mute = self._watch.missing_heartbeat(self._loop.time())
             late = [(node, "no read-back") for node in self._nodes if not (self._image.age_cycles(node.index) <= 1)]
             late += [] if mute is None else [(mute, "no heartbeat")]
+            late += [(node, "no force") for node in self._nodes if self._image.lacks_force(node.index)]
             if not late and self._image.cycles > first:
                 return
             if late and not (self._loop.time() < deadline):

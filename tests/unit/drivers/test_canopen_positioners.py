@@ -2,7 +2,7 @@
 
 import asyncio
 import struct
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 
 import numpy as np
 import pytest
@@ -320,7 +320,131 @@ def test_lost_read_backs_age() -> None:
         bench.bus.keep = lambda cob, data: cob != 0x184
         feedback = await tick(bench, lambda k: q, 6)
         assert feedback[-1].age_cycles[3] >= 5
-        assert not np.delete(feedback[-1].age_cycles, 3).any()
+        # A set that stays incomplete is over when the next begins.
+        assert (np.delete(feedback[-1].age_cycles, 3) == 1.0).all()
+        bench.bus.keep = None
+        feedback = await tick(bench, lambda k: q, 3)
+        assert not feedback[-1].age_cycles.any()
+
+    run(scenario)
+
+
+def steady(q: Array, speed_mm_s: float = 5.0) -> Callable[[int], Array]:
+    """Set-points of axes that all move differently."""
+    return lambda k: q + speed_mm_s * CYCLE_S * k * np.linspace(-1.0, 1.0, 12)
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.003, 0.009])
+def test_read_backs_that_come_in_pieces_are_never_mixed(late_s: float) -> None:
+    async def scenario(bench: Bench) -> None:
+        q = await bench.ready()
+        loop, deliver = asyncio.get_running_loop(), bench.near.on_frames
+
+        def in_pieces(frames: list[tuple[int, bytes]]) -> None:
+            for piece in (frames[:5], frames[5:6]):
+                deliver(piece)
+            loop.call_later(late_s, deliver, frames[6:])
+
+        await tick(bench, lambda k: q, 5)
+        bench.near.on_frames = in_pieces
+        path = steady(q)
+        feedback = await tick(bench, path, 100)
+        assert feedback[-1].fault is None
+        for k, one in enumerate(feedback[3:], 3):
+            assert len(set(one.age_cycles)) == 1
+            assert one.age_cycles[0] == (0.0 if late_s < 0.007 else 1.0)
+            same = [i for i in range(k) if np.abs(one.position_mm - path(i)).max() <= 0.51e-4]
+            assert same == [k - 2 - int(one.age_cycles[0])], "all of one SYNC"
+
+    run(scenario)
+
+
+@pytest.mark.parametrize("lost", [range(0x181, 0x186), range(0x186, 0x18D), (0x181,), (0x18C,)])
+def test_read_backs_in_pieces_stay_together_after_a_loss(lost: Sequence[int]) -> None:
+    async def scenario(bench: Bench) -> None:
+        q = await bench.ready()
+        deliver, turn = bench.near.on_frames, iter(range(10**6))
+
+        def in_pieces(frames: list[tuple[int, bytes]]) -> None:
+            if next(turn) == 10:
+                frames = [frame for frame in frames if frame[0] not in lost]
+            for frame in frames:
+                deliver([frame])
+
+        await tick(bench, lambda k: q, 5)
+        bench.near.on_frames = in_pieces
+        path = steady(q)
+        feedback = await tick(bench, path, 60)
+        for k, one in enumerate(feedback[3:], 3):
+            for axis, lag in enumerate(one.age_cycles.astype(int)):
+                assert one.position_mm[axis] == pytest.approx(path(k - 2 - lag)[axis], abs=0.51e-4)
+        late = [one for one in feedback if one.age_cycles.any()]
+        assert len(late) == 1
+        assert not feedback[-1].age_cycles.any()
+
+    run(scenario)
+
+
+def test_one_lost_read_back_leaves_the_others_whole() -> None:
+    async def scenario(bench: Bench) -> None:
+        q = await bench.ready()
+        path, turn = steady(q), iter(range(10**6))
+        bench.bus.keep = lambda cob, data: cob != 0x184 or next(turn) % 7 != 3
+        feedback = await tick(bench, path, 100)
+        for k, one in enumerate(feedback[3:], 3):
+            lag = one.age_cycles.astype(int)
+            for axis in range(12):
+                assert one.position_mm[axis] == pytest.approx(path(k - 2 - lag[axis])[axis], abs=0.51e-4)
+            assert lag.max() <= 1
+            assert (lag == 0).all() or (lag >= 1).all()
+        assert {int(one.age_cycles.max()) for one in feedback[3:]} == {0, 1}
+
+    run(scenario)
+
+
+def test_a_link_may_use_one_list_for_all_its_batches() -> None:
+    async def scenario(bench: Bench) -> None:
+        q = await bench.ready()
+        deliver, shared = bench.near.on_frames, list[tuple[int, bytes]]()
+
+        def reuse(frames: list[tuple[int, bytes]]) -> None:
+            shared[:] = frames
+            deliver(shared)
+
+        bench.near.on_frames = reuse
+        path = steady(q)
+        await tick(bench, lambda k: q, 5)
+        feedback = await tick(bench, path, 50)
+        for k in range(2, 50):
+            np.testing.assert_allclose(feedback[k].position_mm, path(k - 2), atol=0.51e-4)
+
+    run(scenario)
+
+
+def test_a_force_that_is_not_repeated_for_three_periods_is_forgotten() -> None:
+    async def scenario(bench: Bench) -> None:
+        q = await bench.ready()
+        await tick(bench, lambda k: q, 12)
+        bench.bus.keep = lambda cob, data: cob != 0x284
+        feedback = await tick(bench, lambda k: q, 45)
+        gone = [bool(np.isnan(one.force_n[3])) for one in feedback]
+        assert gone == sorted(gone)
+        # Three periods of ten cycles after the last one, which came up to ten cycles before.
+        assert 20 <= gone.index(True) <= 32
+        assert not np.isnan(np.delete(feedback[-1].force_n, 3)).any()
+        bench.bus.keep = None
+        feedback = await tick(bench, lambda k: q, 13)
+        assert feedback[-1].force_n[3] == pytest.approx(1030.0, abs=5.0)
+
+    run(scenario)
+
+
+def test_a_load_cell_that_never_reports_is_named_before_anything_is_enabled() -> None:
+    async def scenario(bench: Bench) -> None:
+        bench.bus.keep = lambda cob, data: cob != 0x284
+        with pytest.raises(DeviceSilent, match="no force") as caught:
+            await bench.master.bring_up()
+        assert caught.value.where == "B.X"
 
     run(scenario)
 
