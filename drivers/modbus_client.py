@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import struct
-from collections.abc import Callable
 
 from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.exceptions import ModbusIOException
@@ -81,22 +80,16 @@ class _ExchangeReply(_Reply):
 _REPLIES = {READ: _ReadReply, WRITE: _WriteReply, EXCHANGE: _ExchangeReply}
 
 
-def _nothing(reason: str) -> None:
-    return None
-
-
 class ModbusUnit:
     """One unit at `host`:`port`. Construct it inside the running loop; one request at a time.
 
     Every request ends within `timeout_s`: DeviceSilent for a read, OutcomeUnknown for anything that writes,
     DeviceRefused on an exception reply, BadReply on a reply that does not fit, LinkLost when the connection breaks.
-    `on_lost` is called at once, with the reason, when the far end closes the connection.
     """
 
     def __init__(self, where: str, host: str, port: int, unit: int, timeout_s: float) -> None:
         self.where, self._unit, self._timeout_s = where, unit, timeout_s
         self._address = f"{host}:{port}"
-        self.on_lost: Callable[[str], None] = _nothing
         self._request: _Request | None = None
         self._body_bytes = self._skipped = 0
         self.stale_replies = 0
@@ -220,9 +213,7 @@ class ModbusUnit:
 
     def _connection(self, up: bool) -> None:
         if not up:
-            reason = f"{self._address} closed the connection"
-            self._fail(LinkLost(self.where, reason))
-            self.on_lost(reason)
+            self._fail(LinkLost(self.where, f"{self._address} closed the connection"))
 
     def _fail(self, error: Exception) -> None:
         """End the pending request at once."""

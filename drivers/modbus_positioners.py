@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections import deque
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Awaitable, Iterable, Mapping
 from typing import TypeVar, cast
 
 import numpy as np
@@ -71,8 +71,7 @@ def _shown(plc: PositionerPlc) -> AxisState:
 class ModbusPositioners:
     """All positioners of a cell, one PLC each; construct and use it inside one running loop.
 
-    `addresses` overrides host and port of the cell file by positioner name. `on_lost` is called with the positioner
-    and the reason at once when a connection breaks.
+    `addresses` overrides host and port of the cell file by positioner name.
     """
 
     def __init__(self, cell: CellFile, addresses: Mapping[str, tuple[str, int]] | None = None) -> None:
@@ -89,7 +88,6 @@ class ModbusPositioners:
         self._plcs: tuple[PositionerPlc, ...] = ()
         self._watches: tuple[_Watch, ...] = ()
         self._alone = asyncio.Lock()
-        self.on_lost: Callable[[str, str], None] = lambda where, reason: None
         self.path_spread_s = float("nan")
         um = 1.0 / self._map.scale["position_per_mm"]
         self._units = np.array([[um], [um], [self._map.scale["force_n"]]])
@@ -102,12 +100,7 @@ class ModbusPositioners:
             PositionerPlc(p, self._bus, self._map, self._addresses[p.name]) for p in self._cell.positioners
         )
         self._watches = tuple(_Watch() for _ in self._plcs)
-        for plc in self._plcs:
-            plc.unit.on_lost = self._lost_hook(plc.where)
         return tuple(await self._all(plc.bring_up(self._min_fill) for plc in self._plcs))
-
-    def _lost_hook(self, where: str) -> Callable[[str], None]:
-        return lambda reason: self.on_lost(where, reason)
 
     async def enable(self) -> Feedback:
         """Enable the driven axes where they stand; EnableFailed names a PLC that is in fault or does not follow."""
@@ -227,9 +220,12 @@ class ModbusPositioners:
         return plc.waiting > 0 and plc.depth < depth and plc.state in _MOVING
 
     async def close(self) -> None:
-        """Disable all axes (ramp, brakes, power) and disconnect."""
+        """Disable all axes (ramp, brakes, power) and disconnect.
+
+        Raises EnableFailed naming a positioner that did not confirm, when all the others are closed.
+        """
         async with self._alone:
-            await asyncio.gather(*(plc.close() for plc in self._plcs))
+            await self._all(plc.close() for plc in self._plcs)
 
     @staticmethod
     async def _all(tasks: Iterable[Awaitable[T]]) -> list[T]:

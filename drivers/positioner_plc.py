@@ -277,13 +277,38 @@ class PositionerPlc:
         return played * self._segments.dt_ms / 1000.0
 
     async def close(self) -> None:
-        """Disable, wait for closed brakes, disconnect; a dead link is only closed."""
+        """Disable, wait for closed brakes, disconnect; a broken connection is only closed.
+
+        Raises EnableFailed when the PLC is still connected and does not confirm that its axes are off and braked.
+        """
         try:
-            if self.unit.connected and self.state not in ("disabled", "fault", "unknown"):
-                await self.command("disable")
-                await self.reach(ENABLE_S + self._bus.ramp_s, "disabled")
-        except DockingError:
-            # The PLC's own watchdog stops and brakes the axes when this side falls silent.
-            pass
+            if self.unit.connected and self.state not in ("disabled", "unknown"):
+                await self._switch_off()
+        except EnableFailed:
+            raise
+        except DockingError as error:
+            # Behind a broken connection the PLC's own watchdog stops and brakes the axes.
+            if self.unit.connected:
+                cause = f"It did not confirm that its axes are disabled and braked. {error}"
+                raise EnableFailed(self.where, cause, value=self.state) from error
         finally:
             self.unit.close()
+
+    async def _switch_off(self) -> None:
+        """Disable and see the brakes closed; a PLC in fault has done so by itself."""
+        if self.state != "fault":
+            try:
+                await self.command("disable")
+            except DeviceRefused:
+                if self.state != "fault":
+                    raise
+        await self.reach(ENABLE_S + self._bus.ramp_s, "disabled", "fault")
+        self._require_brakes()
+
+    def _require_brakes(self) -> None:
+        """Every driven axis reports its brake closed. Raises EnableFailed."""
+        bit = self._map.flags["axis_braked"]
+        for axis, status in zip(self.config.axes, self.status.axes, strict=True):
+            if axis.driven and not status[3] & bit:
+                name = f"{self.config.name}.{axis.name}"
+                raise EnableFailed(name, "It is disabled, but its brake is not reported closed.", value=self.state)
