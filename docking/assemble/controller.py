@@ -99,12 +99,13 @@ def _motion(cell: CellFile, positioners: Positioners, wires: Wires) -> Motion:
         warp_force_n=limits.warp_force_n,
         missing_cycles=limits.missing_cycles,
     )
-    watch = Watch(positioners, -gravity / np.linalg.norm(gravity), watch_limits)
+    load_cells = np.repeat([station.load_cell for station in cell.positioners], 3)
+    watch = Watch(positioners, -gravity / np.linalg.norm(gravity), watch_limits, load_cells)
     if isinstance(cell.bus, ModbusBus):
         return QueuedMotion(ModbusPositioners(cell, wires.modbus), watch, cell.bus.poll_s)
     if wires.can is None:
         raise ValueError("a CANopen cell needs the near end of its bus")
-    return StreamedMotion(CanopenPositioners(cell, wires.can), watch)
+    return StreamedMotion(CanopenPositioners(cell, wires.can), watch, limits.tick_late_cycles)
 
 
 def _nominals(cell: CellFile, job: JobFile) -> Nominals:

@@ -177,6 +177,9 @@ class LimitsConfig(Model):
     missing_cycles: Annotated[int, Field(ge=1, le=100)] = Field(
         default=2, description="stop after so many cycles without a read-back"
     )
+    tick_late_cycles: Annotated[int, Field(ge=1, le=100)] = Field(
+        default=5, description="stop when a control cycle comes so many cycles late"
+    )
     condition_max: Positive = Field(default=50.0, description="of the driven-axis Jacobian, rotations scaled")
     rotation_length_mm: Positive = Field(
         default=3000.0, description="length that scales rotations, about the arm of the balls, mm"

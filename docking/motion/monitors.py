@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from docking.errors import (
+    AxisNotEnabled,
     BallForceTrip,
     ConsistencyTrip,
     DriveFault,
@@ -17,7 +19,10 @@ from docking.errors import (
     WarpTrip,
 )
 from docking.kinematics import CouplingMonitor, Positioners, coupling_monitor, socket_positions
-from docking.types import Array, Feedback, Plan
+from docking.types import Array, AxisState, Feedback, Plan
+
+LATE_IN_A_ROW = 2
+"""Cycles in a row that go without the figure because a read-back is late, however many may be missed by one axis."""
 
 
 @dataclass(frozen=True)
@@ -36,17 +41,21 @@ class WatchLimits:
 class Watch:
     """Judges read-backs against the commanded figure and keeps the maxima.
 
-    `evaluate` is the hot path: a handful of small array operations a cycle.
+    `load_cells` (m,) are the axes whose force is measured. `evaluate` is the hot path: a handful of small array
+    operations a cycle.
     """
 
-    def __init__(self, positioners: Positioners, up: Array, limits: WatchLimits) -> None:
+    def __init__(self, positioners: Positioners, up: Array, limits: WatchLimits, load_cells: ArrayLike) -> None:
         self._positioners, self._up, self._limits = positioners, up, limits
         self._axes = positioners.axes
         self.driven = np.asarray(positioners.driven, dtype=bool)
         v_max = np.asarray(positioners.v_mm_s, dtype=np.float64)
         self._following_slope = (limits.following_vmax_mm - limits.following_rest_mm) / v_max
         self._rated_n = limits.overload_factor * np.asarray(positioners.rated_n, dtype=np.float64).reshape(-1)
+        self._weighed = np.asarray(load_cells, dtype=bool)
         self._coupling: CouplingMonitor | None = None
+        self._enabled: tuple[AxisState, ...] = ()
+        self._late_in_a_row = 0
         self.residual_mm = 0.0
         self.internal_force_n = 0.0
         self.warp_n = 0.0
@@ -69,8 +78,24 @@ class Watch:
         spare = (self._positioners.a_quick_mm_s2 - self._positioners.a_mm_s2) / np.maximum(peak, 1e-9)
         return max(plan.rate_slew_per_s, float(np.min(spare[self.driven])))
 
-    def evaluate(self, feedback: Feedback, q_ref_mm: Array, speed_mm_s: Array | float) -> MotionError | None:
-        """The first violated limit, or None. `q_ref_mm` (m,) is the rigid figure the read-back belongs to."""
+    def power(self, feedback: Feedback, *, may_stop: bool = False) -> MotionError | None:
+        """The first driven axis that is not enabled, or None; with `may_stop` an axis may also be ramping down."""
+        if feedback.states is self._enabled:
+            return None
+        for axis, state, driven in zip(self._axes, feedback.states, self.driven, strict=True):
+            if driven and not (state is AxisState.ENABLED or (may_stop and state is AxisState.STOPPING)):
+                return AxisNotEnabled(axis, value=state.value, limit=AxisState.ENABLED.value)
+        if not may_stop:
+            self._enabled = feedback.states
+        return None
+
+    def evaluate(
+        self, feedback: Feedback, q_ref_mm: Array, speed_mm_s: Array | float, *, may_stop: bool = False
+    ) -> MotionError | None:
+        """The first violated limit, or None. `q_ref_mm` (m,) is the rigid figure the read-back belongs to.
+
+        `may_stop` says that an axis may be ramping down by itself, as a device does that was told to stop.
+        """
         if feedback.fault is not None:
             axis, code, text = feedback.fault
             return DriveFault(axis, text, value=code)
@@ -78,17 +103,24 @@ class Watch:
         if not (worst_age <= self._limits.missing_cycles):
             axis = self._axes[int(np.argmax(feedback.age_cycles))]
             return FeedbackMissing(axis, value=float(worst_age), limit=self._limits.missing_cycles)
+        off = self.power(feedback, may_stop=may_stop)
+        if off is not None:
+            return off
         if worst_age > 0.0:
-            return self._judge_late(feedback, speed_mm_s)
+            return self._judge_late(feedback, q_ref_mm, speed_mm_s)
+        self._late_in_a_row = 0
         return (
             self._following(feedback.following_error_mm, speed_mm_s)
             or self._figure(feedback.position_mm, q_ref_mm)
             or self._ball_forces(feedback.force_n)
         )
 
-    def _judge_late(self, feedback: Feedback, speed_mm_s: Array | float) -> MotionError | None:
-        """Judge without the figure: a late read-back beside fresh ones would look like a squeezed part."""
+    def _judge_late(self, feedback: Feedback, q_ref_mm: Array, speed_mm_s: Array | float) -> MotionError | None:
+        """Judge without the figure, a few times: a late read-back beside fresh ones would look like a squeezed part."""
+        self._late_in_a_row += 1
         trip = self._following(feedback.following_error_mm, speed_mm_s) or self._ball_forces(feedback.force_n)
+        if trip is None and self._late_in_a_row > LATE_IN_A_ROW:
+            trip = self._figure(feedback.position_mm, q_ref_mm)
         if trip is None:
             return None
         axis = self._axes[int(np.argmax(feedback.age_cycles))]
@@ -128,8 +160,9 @@ class Watch:
         return f"{self._axes[k]} is {off_mm[k]:+.3f} mm from its place."
 
     def _ball_forces(self, force_n: Array) -> MotionError | None:
-        over = np.abs(force_n) > self._rated_n
+        over = ~(np.abs(force_n) <= self._rated_n) & self._weighed
         if not over.any():
             return None
         k = int(np.argmax(over))
-        return BallForceTrip(self._axes[k], value=float(force_n[k]), limit=float(self._rated_n[k]))
+        cause = "Its load cell does not report." if np.isnan(force_n[k]) else ""
+        return BallForceTrip(self._axes[k], cause, value=float(force_n[k]), limit=float(self._rated_n[k]))

@@ -8,7 +8,7 @@ from collections import deque
 
 import numpy as np
 
-from docking.errors import DockingError, PlanStale
+from docking.errors import Defect, DockingError, PlanStale
 from docking.motion.monitors import Watch
 from docking.motion.playback import Playback
 from docking.motion.recorder import Recorder
@@ -34,8 +34,8 @@ class QueuedMotion:
         self._verbs: deque[str] = deque()
         self._idle: asyncio.Task[None] | None = None
         self._cause: DockingError | None = None
-        self._moving = False
-        self._still = 0
+        self._moving = self._slowing = False
+        self._still = self._unasked = 0
 
     async def connect(self) -> tuple[Identity, ...]:
         return await self._bus.bring_up()
@@ -64,7 +64,12 @@ class QueuedMotion:
         self._watch.watch_about(plan.q_mm[0])
         await self._bus.load(plan)
         self._playback = Playback(plan)
-        await self._read(self._playback)
+        self._require_enabled(await self._read(self._playback))
+
+    def _require_enabled(self, feedback: Feedback) -> None:
+        off = self._watch.power(feedback)
+        if off is not None:
+            raise off
 
     async def start(self, plan_hash: str) -> MoveResult:
         if self._cause is not None:
@@ -74,16 +79,19 @@ class QueuedMotion:
         playback, self._playback = self._playback, None
         if playback is None or playback.plan.plan_hash != plan_hash:
             raise PlanStale("motion", "this plan is not loaded")
+        self._require_enabled(self.feedback())
         recorder = Recorder(self._watch, max(1, round(TRACE_PERIOD_S / self._poll_s)))
-        self._moving = True
+        self._moving, self._slowing = True, False
         try:
             outcome = await self._play(playback, recorder)
         except DockingError as error:
             self._cause = self._cause or error
             outcome = "fault"
             await self._stop_all()
-        except asyncio.CancelledError:
-            # Nobody waits for this move any more, so nobody watches it.
+        except BaseException as error:
+            # A defect, or nobody waits for this move any more: so nobody watches it.
+            if isinstance(error, Exception):
+                self._cause = self._cause or _defect(error)
             await self._stop_all()
             raise
         finally:
@@ -136,16 +144,27 @@ class QueuedMotion:
     async def _read(self, playback: Playback | None) -> Feedback:
         feedback = await self._bus.poll()
         self._feedback = feedback
+        may_stop = self._may_stop(feedback)
         if playback is None:
-            cause = self._watch.evaluate(feedback, self._commanded, 0.0)
+            cause = self._watch.evaluate(feedback, self._commanded, 0.0, may_stop=may_stop)
         else:
             at = feedback.path_time_s
-            cause = self._watch.evaluate(feedback, playback.chord_at(at), playback.speed_at(at))
+            chord, speed = playback.chord_at(at), playback.speed_at(at)
+            cause = self._watch.evaluate(feedback, chord, speed, may_stop=may_stop)
         if cause is not None and self._cause is None:
             self._cause = cause
             if self._moving:
                 await self._command("stop")
         return feedback
+
+    def _may_stop(self, feedback: Feedback) -> bool:
+        """Whether an axis may be ramping down now: after a hold or a stop, and for one poll without.
+
+        A controller that faults takes the others along over the common line; the next poll tells which it was.
+        """
+        unasked = AxisState.STOPPING in feedback.states and not self._slowing
+        self._unasked = self._unasked + 1 if unasked else 0
+        return self._moving and self._unasked <= 1
 
     async def _obey(self, feedback: Feedback, stop_asked: bool, ended: bool) -> bool:
         """Pass on one verb, so that the next is judged by a read-back that shows its effect."""
@@ -164,6 +183,7 @@ class QueuedMotion:
 
     async def _command(self, verb: str) -> None:
         self._still = 0
+        self._slowing = verb in ("hold", "stop")
         await self._bus.command(verb)
 
     async def _stop_all(self) -> None:
@@ -186,6 +206,10 @@ class QueuedMotion:
             except DockingError as error:
                 self._cause = self._cause or error
                 return
+            except Exception as error:
+                self._cause = self._cause or _defect(error)
+                await self._stop_all()
+                raise
 
     def request(self, verb: str) -> None:
         if verb != "resume":
@@ -209,3 +233,10 @@ class QueuedMotion:
             self._idle.cancel()
             await asyncio.gather(self._idle, return_exceptions=True)
             self._idle = None
+
+
+def _defect(error: Exception) -> Defect:
+    """An error of the program itself, as the cause that is kept."""
+    defect = Defect("motion", f"{type(error).__name__}: {error}")
+    defect.__cause__ = error
+    return defect

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from docking.errors import DockingError, DriveFault, FeedbackMissing, PlanStale, TickLate
+from docking.errors import AxisNotEnabled, Defect, DockingError, DriveFault, FeedbackMissing, PlanStale, TickLate
 from docking.motion.monitors import Watch
 from docking.motion.playback import Playback
 from docking.motion.recorder import Recorder
@@ -17,7 +17,6 @@ from docking.ports import StreamedPositioners
 from docking.types import Array, Feedback, Identity, MoveResult, Plan, readonly
 
 START_TOLERANCE_MM = 0.01
-LATE_LIMIT_CYCLES = 20
 SHORTEST_CYCLE = 0.9
 TRACE_PERIOD_S = 0.1
 
@@ -34,12 +33,16 @@ class _Move:
 
 
 class StreamedMotion:
-    """The `Motion` port over `StreamedPositioners`. Owns the tick from `enable` to `close`."""
+    """The `Motion` port over `StreamedPositioners`. Owns the tick from `enable` to `close`.
 
-    def __init__(self, positioners: StreamedPositioners, watch: Watch) -> None:
+    A tick that comes more than `late_cycles` late stops the axes.
+    """
+
+    def __init__(self, positioners: StreamedPositioners, watch: Watch, late_cycles: float) -> None:
         self._bus, self._watch = positioners, watch
         self.axes = positioners.axes
         self._cycle_s = positioners.cycle_s
+        self._late_limit_s = late_cycles * self._cycle_s
         self._setpoint: Array = np.zeros(len(self.axes))
         self._history: deque[Array] = deque(maxlen=3)
         self._feedback: Feedback | None = None
@@ -79,8 +82,14 @@ class StreamedMotion:
         gap = float(np.max(np.abs(plan.q_mm[0] - self._setpoint)[self._watch.driven]))
         if not (gap <= START_TOLERANCE_MM):
             raise PlanStale(plan.stage, f"it starts {gap:.4f} mm from where the axes are commanded")
+        self._require_enabled()
         self._watch.watch_about(plan.q_mm[0])
         self._loaded = Playback(plan)
+
+    def _require_enabled(self) -> None:
+        off = self._watch.power(self.feedback())
+        if off is not None:
+            raise off
 
     async def start(self, plan_hash: str) -> MoveResult:
         if self._cause is not None:
@@ -90,6 +99,7 @@ class StreamedMotion:
         playback, self._loaded = self._loaded, None
         if playback is None or playback.plan.plan_hash != plan_hash:
             raise PlanStale("motion", "this plan is not loaded")
+        self._require_enabled()
         recorder = Recorder(self._watch, max(1, round(TRACE_PERIOD_S / self._cycle_s)))
         done: asyncio.Future[MoveResult] = asyncio.get_running_loop().create_future()
         self._move = _Move(playback, recorder, done, asyncio.Event())
@@ -150,11 +160,13 @@ class StreamedMotion:
         except DockingError as error:
             self._give_up(error, move)
         except Exception as error:
-            # A defect: no more set-points, so the drives stop by themselves, and whoever waits for the move learns why.
+            # A defect: no more set-points. Whoever waits for the move learns why, and so does everyone who asks later.
+            self._cause = self._cause or Defect("motion", f"{type(error).__name__}: {error}")
             if move is not None:
                 self._end(move)
                 if not move.done.done():
                     move.done.set_exception(error)
+            self._bus.quick_stop()
             raise
 
     def _cycle(self, move: _Move | None) -> None:
@@ -193,12 +205,12 @@ class StreamedMotion:
         return self._watch.evaluate(feedback, self._history[0], speed)
 
     def _lateness(self, late_s: float) -> DockingError | None:
-        limit = LATE_LIMIT_CYCLES * self._cycle_s
+        limit = self._late_limit_s
         return TickLate("motion", value=late_s, limit=limit) if not (late_s <= limit) else None
 
     def _trip(self, cause: DockingError, move: _Move | None) -> None:
         """Keep the first cause and stop on the path; axes that cannot be led there stop by themselves, now or later."""
-        if isinstance(cause, DriveFault | FeedbackMissing) and not self._left_alone:
+        if isinstance(cause, DriveFault | FeedbackMissing | AxisNotEnabled) and not self._left_alone:
             self._left_alone = True
             self._bus.quick_stop()
         if self._cause is not None:
@@ -232,6 +244,7 @@ def _same(before: Feedback, now: Feedback) -> bool:
         now.position_mm is before.position_mm
         and now.following_error_mm is before.following_error_mm
         and now.force_n is before.force_n
+        and now.states is before.states
         and now.age_cycles is before.age_cycles
         and now.fault is before.fault
     )

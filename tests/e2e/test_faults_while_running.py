@@ -12,6 +12,7 @@ import pytest
 from docking import cli
 from docking.assemble import runs
 from docking.errors import (
+    AxisNotEnabled,
     BadReply,
     BallForceTrip,
     ConsistencyTrip,
@@ -172,7 +173,8 @@ def test_a_tracker_that_sends_rubbish_is_named(tmp_path):
 def test_a_node_lost_in_a_move_is_named_and_all_drives_stop(tmp_path):
     run = run_dry("lab-can", 1, tmp_path, lambda run: mid_move(run, run.drives.mute, "C.Y"))
     # The load cells may feel that one axis stands before three cycles of silence have passed; the silence is told then.
-    assert_faulted(run, (FeedbackMissing, DriveFault, BallForceTrip), "C.Y")
+    kinds = (FeedbackMissing, DriveFault, BallForceTrip, ConsistencyTrip, InternalForceTrip, WarpTrip)
+    assert_faulted(run, kinds, "C.Y")
     assert run.records("moved")[0]["result"] == "fault"
     others = [axis for axis in run.left_on if axis != "C.Y"]
     assert others == []
@@ -190,6 +192,38 @@ def test_a_drive_that_trips_in_a_move_is_named(tmp_path):
     run = run_dry("lab-can", 1, tmp_path, lambda run: mid_move(run, run.drives.trip, "B.X", 0x2310))
     assert_faulted(run, DriveFault, "B.X")
     assert run.left_on == []
+
+
+@pytest.mark.parametrize("state", ["measure", "confirm", "move"])
+def test_an_axis_that_loses_its_torque_without_a_word_is_named_in_three_cycles(state, tmp_path):
+    off_s: list[float] = []
+
+    def scenario(run: DryCell) -> None:
+        def take_torque() -> None:
+            off_s.append(run.loop.time())
+            run.drives.drives.disable_voltage(run.cell.axis_names.index("A.X"), run.loop.time())
+            run.loop.call_later(3.5 * run.cell.bus.cycle_s, seen)
+
+        def seen() -> None:
+            if state == "move":
+                return
+            with pytest.raises(AxisNotEnabled, match=r"A\.X"):
+                run.controller.procedure.motion.feedback()
+            off_s.append(run.loop.time())
+
+        in_state(run, state, take_torque, delay_s=0.0 if state == "confirm" else 0.5)
+
+    run = run_dry("lab-can", 1, tmp_path, scenario)
+    assert_faulted(run, AxisNotEnabled, "A.X")
+    assert run.left_on == []
+    assert len(off_s) == (1 if state == "move" else 2)
+    moved = run.records("moved")
+    if state == "measure":
+        assert moved == run.plans == []
+        _, table = run.setpoints_mm()
+        assert np.ptp(table[-400:], axis=0).max() <= 0.002
+    elif state == "move":
+        assert moved[0]["result"] == "fault"
 
 
 def test_a_drive_that_restarts_is_named(tmp_path):

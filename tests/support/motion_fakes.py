@@ -6,8 +6,9 @@ import asyncio
 from collections import deque
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from docking.errors import DeviceRefused, DockingError
+from docking.errors import DeviceRefused
 from docking.kinematics import Positioners
 from docking.motion.monitors import Watch, WatchLimits
 from docking.types import Array, AxisState, Feedback, Identity, Plan
@@ -23,8 +24,13 @@ LIMITS = WatchLimits(
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def watch_of(positioners: Positioners, limits: WatchLimits = LIMITS) -> Watch:
-    return Watch(positioners, UP, limits)
+LATE_CYCLES = 20
+
+
+def watch_of(positioners: Positioners, limits: WatchLimits = LIMITS, load_cells: ArrayLike | None = None) -> Watch:
+    """The watch of positioners without load cells, or with one under each axis of the mask (m,)."""
+    fitted = np.zeros(len(positioners.axes), dtype=bool) if load_cells is None else load_cells
+    return Watch(positioners, UP, limits, fitted)
 
 
 def read_back(position_mm: Array, **changes: object) -> Feedback:
@@ -87,7 +93,7 @@ class QueuedFake:
         self.verbs: list[str] = []
         self.changes: dict[str, object] = {}
         self.offset_mm = np.zeros(len(axes))
-        self.error: DockingError | None = None
+        self.error: Exception | None = None
         self.closed = False
         self.loaded: Plan | None = None
         self._start_mm = start_mm

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from docking.errors import (
+    AxisNotEnabled,
     BallForceTrip,
     ConsistencyTrip,
     DriveFault,
@@ -16,6 +17,7 @@ from docking.errors import (
     InternalForceTrip,
     WarpTrip,
 )
+from docking.types import AxisState
 from tests.reference_geometry import AXES, rc1
 from tests.support.motion_fakes import LIMITS, read_back, watch_of
 from tests.support.planned_moves import a_plan, lab_site
@@ -33,6 +35,20 @@ def rc1_watch(limits=LIMITS):
     watch = watch_of(rc1(), limits)
     watch.watch_about(Q)
     return watch
+
+
+def weighing_watch():
+    """RC-1 with a load cell under each ball but D's."""
+    watch = watch_of(rc1(), load_cells=[True] * 9 + [False] * 3)
+    watch.watch_about(Q)
+    return watch
+
+
+def forces(row: int, value: float):
+    """Forces (12,) as the watch above gets them, one of them `value`."""
+    force = np.array([0.0] * 9 + [np.nan] * 3)
+    force[row] = value
+    return force
 
 
 def pattern(axis: int, a: float, b: float, c: float, d: float):
@@ -192,17 +208,53 @@ def test_a_fault_of_a_drive_comes_before_what_follows_from_it():
     assert (trip.where, trip.value, trip.cause) == ("D.Y", 0x7305, "encoder")
 
 
-@pytest.mark.parametrize(("row", "rated"), [(0, 10000.0), (4, 10000.0), (11, 50000.0)])
+@pytest.mark.parametrize(("row", "rated"), [(0, 10000.0), (4, 10000.0), (8, 50000.0)])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_an_overloaded_ball_trips_and_names_the_axis(row, rated, sign):
-    force = np.full(12, np.nan)
-    force[row] = sign * 1.0999 * rated
-    assert rc1_watch().evaluate(read_back(Q, force_n=force), Q, 0.0) is None
-    force[row] = sign * 1.1001 * rated
-    trip = rc1_watch().evaluate(read_back(Q, force_n=force), Q, 0.0)
+    force = forces(row, sign * 1.0999 * rated)
+    assert weighing_watch().evaluate(read_back(Q, force_n=force), Q, 0.0) is None
+    force = forces(row, sign * 1.1001 * rated)
+    trip = weighing_watch().evaluate(read_back(Q, force_n=force), Q, 0.0)
     assert isinstance(trip, BallForceTrip)
     assert trip.where == AXES[row]
     assert trip.limit == pytest.approx(1.1 * rated)
+
+
+@pytest.mark.parametrize("row", range(9))
+def test_a_load_cell_that_does_not_report_trips(row):
+    trip = weighing_watch().evaluate(read_back(Q, force_n=forces(row, np.nan)), Q, 0.0)
+    assert isinstance(trip, BallForceTrip)
+    assert trip.where == AXES[row]
+    assert "does not report" in trip.text()
+
+
+@pytest.mark.parametrize("state", [s for s in AxisState if s is not AxisState.ENABLED])
+@pytest.mark.parametrize("row", [0, 7])
+def test_a_driven_axis_that_is_not_enabled_trips(row, state):
+    states = [AxisState.ENABLED] * 12
+    states[row] = state
+    watch = rc1_watch()
+    told = read_back(Q, states=tuple(states))
+    trip = watch.evaluate(told, Q, 0.0)
+    assert isinstance(trip, AxisNotEnabled)
+    assert (trip.where, trip.value, trip.limit) == (AXES[row], state.value, "enabled")
+    stopping = state is AxisState.STOPPING
+    assert (watch.evaluate(told, Q, 0.0, may_stop=True) is None) == stopping
+    # What was let pass once is judged again when no stop is under way.
+    assert isinstance(watch.evaluate(told, Q, 0.0), AxisNotEnabled)
+    late = np.zeros(12)
+    late[3] = 1.0
+    assert isinstance(watch.evaluate(read_back(Q, states=tuple(states), age_cycles=late), Q, 0.0), AxisNotEnabled)
+
+
+def test_a_passive_axis_is_never_enabled():
+    driven = np.ones(12, dtype=bool)
+    driven[3] = False
+    watch = watch_of(rc1(driven=driven))
+    watch.watch_about(Q)
+    states = [AxisState.ENABLED] * 12
+    states[3] = AxisState.DISABLED
+    assert watch.evaluate(read_back(Q, states=tuple(states)), Q, 0.0) is None
 
 
 def test_maxima_are_kept_until_the_next_move():
@@ -227,19 +279,37 @@ def test_a_coupling_trip_names_the_axis_that_is_out_of_its_place(row):
 
 
 def test_a_late_read_back_is_no_squeezed_part_but_is_told_with_what_else_trips():
-    watch = rc1_watch()
+    watch = weighing_watch()
     moved = np.full(12, 0.3)
     moved[4] = 0.0
     age = np.zeros(12)
     age[4] = 2.0
     assert isinstance(watch.evaluate(read_back(moved), Q, 0.0), ConsistencyTrip)
-    assert watch.evaluate(read_back(moved, age_cycles=age), Q, 0.0) is None
-    force = np.full(12, 0.0)
-    force[1] = 20000.0
-    trip = watch.evaluate(read_back(moved, age_cycles=age, force_n=force), Q, 0.0)
+    assert watch.evaluate(read_back(moved, age_cycles=age, force_n=forces(1, 0.0)), Q, 0.0) is None
+    trip = watch.evaluate(read_back(moved, age_cycles=age, force_n=forces(1, 20000.0)), Q, 0.0)
     assert isinstance(trip, BallForceTrip)
     assert trip.where == "A.Y"
     assert "B.Y has not reported for 2 cycles" in trip.text()
+
+
+def test_the_figure_is_left_unjudged_for_two_cycles_in_a_row_at_most():
+    watch = rc1_watch(replace(LIMITS, missing_cycles=20))
+    squeezed = np.full(12, 0.3)
+    squeezed[4] = 0.0
+    age = np.zeros(12)
+    age[4] = 1.0
+    late, fresh = read_back(squeezed, age_cycles=age), read_back(Q)
+    for _ in range(3):
+        assert [watch.evaluate(late, Q, 0.0) for _ in range(2)] == [None, None]
+        assert watch.evaluate(fresh, Q, 0.0) is None
+    assert [watch.evaluate(late, Q, 0.0) for _ in range(2)] == [None, None]
+    trip = watch.evaluate(late, Q, 0.0)
+    assert isinstance(trip, ConsistencyTrip)
+    assert "B.Y has not reported for 1 cycles" in trip.text()
+    # All late alike: the figure as it was, somewhere along the path.
+    watch = rc1_watch(replace(LIMITS, missing_cycles=20))
+    behind = read_back(np.tile([-0.3, 0.1, 0.2], 4), age_cycles=np.ones(12))
+    assert [watch.evaluate(behind, Q, 0.0) for _ in range(10)] == [None] * 10
 
 
 def test_a_fault_may_stop_a_plan_as_hard_as_the_axes_can():

@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from docking.errors import DeviceSilent, DriveFault, FollowingErrorTrip, LinkLost, PlanStale
+from docking.errors import AxisNotEnabled, Defect, DeviceSilent, DriveFault, FollowingErrorTrip, LinkLost, PlanStale
 from docking.motion import QueuedMotion
+from docking.types import AxisState
 from sim.virtual_time import run_virtual
 from tests.support.motion_fakes import QueuedFake, watch_of
 from tests.support.planned_moves import a_plan, lab_site
@@ -282,6 +283,79 @@ def test_a_fault_is_held_until_the_axes_are_enabled_again():
         assert len(asyncio.all_tasks()) == 2, "two keepers run side by side"
         await bench.motion.load(PLAN)
         assert (await bench.motion.start(PLAN.plan_hash)).result == "done"
+
+    on_bench(scenario)
+
+
+@pytest.mark.parametrize("moving", [True, False])
+def test_a_defect_stops_all_and_is_held(moving):
+    async def scenario(bench):
+        bench.bus.__class__ = Deaf
+        if moving:
+            move = await bench.begin()
+            await asyncio.sleep(0.5 * PLAN.duration_s)
+        else:
+            await bench.motion.enable()
+        bench.bus.error = ZeroDivisionError("a defect")
+        if moving:
+            with pytest.raises(ZeroDivisionError):
+                await move
+        await asyncio.sleep(0.2)
+        bench.bus.error = None
+        assert bench.bus.verbs[-1:] == ["stop"]
+        with pytest.raises(Defect, match="ZeroDivisionError: a defect"):
+            bench.motion.feedback()
+        with pytest.raises(Defect):
+            await bench.motion.load(PLAN)
+
+    on_bench(scenario)
+
+
+def states(state: AxisState) -> tuple[AxisState, ...]:
+    return (*[AxisState.ENABLED] * 3, *[state] * 3, *[AxisState.ENABLED] * 6)
+
+
+@pytest.mark.parametrize("moving", [True, False])
+def test_an_axis_that_falls_out_is_named(moving):
+    async def scenario(bench):
+        if moving:
+            move = await bench.begin()
+            after(0.5 * PLAN.duration_s, bench.bus.changes.__setitem__, "states", states(AxisState.DISABLED))
+            assert_faulted(await move, AxisNotEnabled, "B.X")
+            assert bench.bus.verbs == ["run", "stop"]
+        else:
+            await bench.motion.enable()
+            await bench.motion.load(PLAN)
+            bench.bus.changes["states"] = states(AxisState.DISABLED)
+            await asyncio.sleep(0.1)
+            with pytest.raises(AxisNotEnabled):
+                await bench.motion.start(PLAN.plan_hash)
+            assert "run" not in bench.bus.verbs
+
+    on_bench(scenario)
+
+
+@pytest.mark.parametrize("seconds", [0.049, 3.0])
+def test_axes_that_ramp_down_unasked_are_a_fault_unless_the_next_poll_tells_why(seconds):
+    async def scenario(bench):
+        move = await bench.begin()
+        after(0.5 * PLAN.duration_s, bench.bus.changes.__setitem__, "states", states(AxisState.STOPPING))
+        told = {"fault": ("D.X", 2, "underrun"), "states": states(AxisState.ENABLED)}
+        after(0.5 * PLAN.duration_s + seconds, bench.bus.changes.update, told)
+        kind, where = (DriveFault, "D.X") if seconds < 1.0 else (AxisNotEnabled, "B.X")
+        after(0.5 * PLAN.duration_s + 3.0, bench.bus.changes.clear)
+        assert_faulted(await move, kind, where)
+        assert bench.bus.verbs == ["run", "stop"]
+
+    on_bench(scenario)
+
+
+def test_nothing_is_loaded_with_an_axis_off():
+    async def scenario(bench):
+        await bench.motion.enable()
+        bench.bus.changes["states"] = states(AxisState.DISABLED)
+        with pytest.raises(AxisNotEnabled):
+            await bench.motion.load(PLAN)
 
     on_bench(scenario)
 

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from docking.errors import (
+    AxisNotEnabled,
     ConsistencyTrip,
+    Defect,
     DriveFault,
     FeedbackMissing,
     FollowingErrorTrip,
@@ -18,8 +20,9 @@ from docking.errors import (
     TickLate,
 )
 from docking.motion import StreamedMotion
+from docking.types import AxisState
 from sim.virtual_time import run_virtual
-from tests.support.motion_fakes import StreamedFake, watch_of
+from tests.support.motion_fakes import LATE_CYCLES, StreamedFake, read_back, watch_of
 from tests.support.planned_moves import a_plan, lab_site
 from tests.support.rigid_figure import path_gap_mm, rigid_gap_mm, sockets_mm
 
@@ -34,7 +37,7 @@ class Bench:
 
     def __init__(self, start_mm=None) -> None:
         self.bus = StreamedFake(POSITIONERS.axes, np.array(PLAN.q_mm[0]) if start_mm is None else start_mm)
-        self.motion = StreamedMotion(self.bus, watch_of(POSITIONERS))
+        self.motion = StreamedMotion(self.bus, watch_of(POSITIONERS), LATE_CYCLES)
 
     async def begin(self):
         """Enable, load the plan, start it; returns the task of the move."""
@@ -252,6 +255,7 @@ def test_a_coupling_trip_stops_all_axes_on_the_path():
     [
         ({"fault": ("C.X", 0x2310, "overcurrent")}, DriveFault, "C.X"),
         ({"age_cycles": np.array([0.0] * 9 + [5.0, 0.0, 0.0])}, FeedbackMissing, "D.X"),
+        ({"states": (*[AxisState.ENABLED] * 4, AxisState.DISABLED, *[AxisState.ENABLED] * 7)}, AxisNotEnabled, "B.Y"),
     ],
 )
 def test_a_drive_that_cannot_be_led_makes_all_stop_by_themselves(changes, kind, where):
@@ -293,6 +297,55 @@ def test_a_defect_in_the_tick_reaches_whoever_waits_for_the_move():
         with pytest.raises(ZeroDivisionError):
             await move
         assert [type(error) for error in seen] == [ZeroDivisionError]
+        assert bench.bus.quick_stops == 1
+
+    on_bench(scenario)
+
+
+def test_a_defect_at_rest_stops_the_drives_and_is_held():
+    async def scenario(bench):
+        seen = []
+        asyncio.get_running_loop().set_exception_handler(lambda loop, context: seen.append(context["exception"]))
+        await bench.motion.enable()
+        await bench.motion.load(PLAN)
+        bench.bus.error = ZeroDivisionError("a defect")
+        await asyncio.sleep(0.05)
+        assert [type(error) for error in seen] == [ZeroDivisionError]
+        assert bench.bus.quick_stops == 1
+        with pytest.raises(Defect, match="ZeroDivisionError: a defect"):
+            bench.motion.feedback()
+        with pytest.raises(Defect):
+            await bench.motion.start(PLAN.plan_hash)
+
+    on_bench(scenario)
+
+
+DISABLED = (AxisState.DISABLED, *[AxisState.ENABLED] * 11)
+
+
+def test_an_axis_that_falls_out_at_rest_stops_the_drives_within_a_cycle():
+    async def scenario(bench):
+        await bench.motion.enable()
+        await asyncio.sleep(0.105)
+        bench.bus.changes["states"] = DISABLED
+        await asyncio.sleep(0.01)
+        assert bench.bus.quick_stops == 1
+        with pytest.raises(AxisNotEnabled, match=r"A\.X: the axis is disabled"):
+            bench.motion.feedback()
+
+    on_bench(scenario)
+
+
+@pytest.mark.parametrize("loaded", [False, True])
+def test_nothing_is_loaded_or_started_with_an_axis_off(loaded):
+    async def scenario(bench):
+        await bench.motion.enable()
+        if loaded:
+            await bench.motion.load(PLAN)
+        # Seen in the read-back, not yet by a tick.
+        bench.motion._feedback = read_back(np.array(PLAN.q_mm[0]), states=DISABLED)
+        with pytest.raises(AxisNotEnabled):
+            await (bench.motion.start(PLAN.plan_hash) if loaded else bench.motion.load(PLAN))
 
     on_bench(scenario)
 
@@ -387,6 +440,23 @@ def test_a_move_that_nobody_waits_for_is_stopped_on_the_path(how):
         assert steps[-1] < 0.05 * steps.max(), "the last set-points before closing still move"
         bench.assert_on_the_path()
         await asyncio.gather(move, return_exceptions=True)
+
+    on_bench(scenario)
+
+
+@pytest.mark.parametrize("late_s", [0.19, 0.06])
+def test_how_late_a_tick_may_come_is_the_cells_to_say(late_s):
+    async def scenario(bench):
+        bench.motion = StreamedMotion(bench.bus, watch_of(POSITIONERS), LATE_CYCLES if late_s > 0.1 else 5)
+        move = await bench.begin()
+        loop = asyncio.get_running_loop()
+        after(0.5 * PLAN.duration_s, lambda: setattr(loop, "_now", loop.time() + late_s))
+        result = await move
+        if late_s > 0.1:
+            assert result.result == "done"
+        else:
+            assert isinstance(result.cause, TickLate)
+            assert result.cause.limit == pytest.approx(0.05)
 
     on_bench(scenario)
 
