@@ -3,31 +3,34 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
+import os
 import selectors
 import signal
 import sys
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 T = TypeVar("T")
 
 SWITCH_S = 0.0005
 """Longest time a thread that computes keeps the interpreter from the ticks."""
+TICKS, COMPUTING = 10, 1
+"""Real-time priorities: both go before ordinary programs, the ticks before what is worked out aside."""
 
 
-def _loop() -> asyncio.AbstractEventLoop:
-    # epoll rounds every wait up to a whole millisecond, select does not.
-    return asyncio.SelectorEventLoop(selectors.SelectSelector())
+def run_real(main: Callable[[], Coroutine[Any, Any, T]], say_late: Callable[[], None] | None = None) -> T:
+    """Run `main()` to its end in real time and return its result.
 
-
-def run_real(main: Callable[[], Coroutine[Any, Any, T]]) -> T:
-    """Run `main()` to its end in real time and return its result."""
-    sys.setswitchinterval(SWITCH_S)
-    # What is loaded by now stays: a collection that walks through it would take tens of milliseconds.
-    gc.collect()
-    gc.freeze()
-    with asyncio.Runner(loop_factory=_loop) as runner:
+    `say_late` is called where the operating system gives this program no priority over others, so that ticks may come
+    late on a busy computer.
+    """
+    with _punctual() as first, asyncio.Runner(loop_factory=_loop) as runner:
+        if not first and say_late is not None:
+            say_late()
         return runner.run(main())
 
 
@@ -41,3 +44,38 @@ def on_interrupt(act: Callable[[], None]) -> None:
 async def aside(work: Callable[[], T]) -> T:
     """`docking.ports.Aside` in real time: in a thread, while the loop goes on ticking."""
     return await asyncio.to_thread(work)
+
+
+def _loop() -> asyncio.AbstractEventLoop:
+    # epoll rounds every wait up to a whole millisecond, select does not.
+    loop = asyncio.SelectorEventLoop(selectors.SelectSelector())
+    loop.set_default_executor(ThreadPoolExecutor(initializer=_go_before_others, initargs=(COMPUTING,)))
+    return loop
+
+
+def _go_before_others(priority: int) -> bool:
+    """Give the calling thread, and those it starts, a real-time priority; False where that is not allowed."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
+    except (OSError, AttributeError):
+        return False
+    return True
+
+
+@contextmanager
+def _punctual() -> Iterator[bool]:
+    """Priority, short turns for computing threads, no long garbage collections; all as before afterwards."""
+    turn_s = sys.getswitchinterval()
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+    first = _go_before_others(TICKS)
+    sys.setswitchinterval(SWITCH_S)
+    # What is loaded by now stays: a collection that walks through it would take tens of milliseconds.
+    gc.collect()
+    gc.freeze()
+    try:
+        yield first
+    finally:
+        gc.unfreeze()
+        sys.setswitchinterval(turn_s)
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, policy, parameters)

@@ -128,7 +128,7 @@ def run_on_wires(request: RunRequest, choice: WireChoice, say: Say, *, step: boo
                 if far is not None:
                     await far.close()
 
-        return _finish(request, path, run_real(main))
+        return _finish(request, path, run_real(main, lambda: say(tell(request.language, "no_priority"))))
 
 
 def serve(request: RunRequest, wires_file: Path | None, say: Say) -> None:
