@@ -193,7 +193,8 @@ class Procedure:
     async def _judge(self) -> Event:
         p, station = self.progress, self._station()
         fit, mate = self._component_fit(), self._mate_fit()
-        errors = self._approach.errors(fit, mate, station, self._drift_sigma_mm())
+        drift_mm = self._drift_sigma_mm()
+        errors = await self._survey.aside(lambda: self._approach.errors(fit, mate, station, drift_mm))
         p.errors = errors
         when = "before" if p.moves == 0 else "after"
         p.history.append(self._approach.look(errors, station, p.corrections, p.passes))
@@ -254,7 +255,7 @@ class Procedure:
         return Event.PLANNED
 
     async def _ask(self) -> Event:
-        plan, shown = self._planned(), self._shown()
+        plan, shown = self._planned(), await self._shown()
         self.operator.show(plan, shown)
         station = self._station()
         missing = await self.operator.permissives(station.permissives)
@@ -273,10 +274,11 @@ class Procedure:
     def _fit_age_s(self) -> float:
         return self._survey.clock() - self.progress.fitted_at_s
 
-    def _shown(self) -> dict[str, Any]:
+    async def _shown(self) -> dict[str, Any]:
         """The features' deviation from the goal of the planned move, and which axes only follow."""
         station, driven = self._station(), self._settings.positioners.driven
-        errors = self._approach.errors(self._component_fit(), self._mate_fit(), station, self._drift_sigma_mm())
+        fit, mate, drift_mm = self._component_fit(), self._mate_fit(), self._drift_sigma_mm()
+        errors = await self._survey.aside(lambda: self._approach.errors(fit, mate, station, drift_mm))
         passive = [axis for axis, on in zip(self.motion.axes, driven, strict=True) if not on]
         return {**records.features_record(errors, station.name, "before"), "passive": passive}
 
