@@ -1,17 +1,18 @@
 """The only importer of pymodbus: one unit behind a strict wrapper. Registers travel as big-endian bytes.
 
-pymodbus accepts replies of a wrong length or function, and a reply with transaction 0 as an answer to anything. Here
-each reply frame is checked as bytes before pymodbus decodes it; a stale reply is dropped. Nothing is sent twice.
+pymodbus connects, numbers and frames the requests. It would accept replies of a wrong length or function, and a reply
+with transaction 0 as an answer to anything: here each reply frame is judged as bytes and never reaches its decoder; a
+stale reply is dropped. Nothing is sent twice.
 """
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import struct
 
 from pymodbus.client import AsyncModbusTcpClient
-from pymodbus.exceptions import ModbusIOException
-from pymodbus.pdu import ExceptionResponse, ModbusPDU
+from pymodbus.pdu import ModbusPDU
 
 from docking.errors import BadReply, DeviceRefused, DeviceSilent, LinkLost, OutcomeUnknown, PortMissing
 
@@ -37,8 +38,6 @@ _MBAP = struct.Struct(">HHHBB")
 _SPAN = struct.Struct(">HH")
 _WRITE = struct.Struct(">HHB")
 _EXCHANGE = struct.Struct(">HHHHB")
-_NEVER = 1 << 30
-"""Unanswered requests after which pymodbus may close the connection by itself."""
 
 
 class _Request(ModbusPDU):
@@ -53,33 +52,6 @@ class _Request(ModbusPDU):
         return self.body
 
 
-class _Reply(ModbusPDU):
-    """A reply whose body stays bytes."""
-
-    body = b""
-
-    def decode(self, data: bytes) -> None:
-        self.body = bytes(data)
-
-    def __str__(self) -> str:
-        return f"function {self.function_code}: {self.body.hex(' ')}"
-
-
-class _ReadReply(_Reply):
-    function_code = READ
-
-
-class _WriteReply(_Reply):
-    function_code = WRITE
-
-
-class _ExchangeReply(_Reply):
-    function_code = EXCHANGE
-
-
-_REPLIES = {READ: _ReadReply, WRITE: _WriteReply, EXCHANGE: _ExchangeReply}
-
-
 class ModbusUnit:
     """One unit at `host`:`port`. Construct it inside the running loop; one request at a time.
 
@@ -91,6 +63,7 @@ class ModbusUnit:
         self.where, self._unit, self._timeout_s = where, unit, timeout_s
         self._address = f"{host}:{port}"
         self._request: _Request | None = None
+        self._reply: asyncio.Future[tuple[int, bytes]]
         self._body_bytes = self._skipped = 0
         self.stale_replies = 0
         self._client = AsyncModbusTcpClient(
@@ -102,8 +75,6 @@ class ModbusUnit:
             trace_packet=self._inspect,
             trace_connect=self._connection,
         )
-        for reply in _REPLIES.values():
-            self._client.register(reply)
 
     @property
     def connected(self) -> bool:
@@ -111,13 +82,8 @@ class ModbusUnit:
 
     async def connect(self) -> None:
         """Open the connection; PortMissing when nobody listens."""
-        context = self._client.ctx
-        # pymodbus has one time-out for connecting and for replies, and gives up a link after a few silent replies.
-        context.comm_params.timeout_connect = CONNECT_S
         if not await self._client.connect():
             raise PortMissing(self.where, f"no Modbus TCP server answered within {CONNECT_S} s", value=self._address)
-        context.comm_params.timeout_connect = self._timeout_s
-        context.count_until_disconnect = context.max_until_disconnect = _NEVER
 
     def close(self) -> None:
         self._client.close()
@@ -145,26 +111,25 @@ class ModbusUnit:
         return reply[1:]
 
     async def _ask(self, function: int, body: bytes, body_bytes: int) -> bytes:
-        """Send one request; return the body of the reply, which carries `body_bytes` of data."""
+        """Send one request; return the body of its reply, which carries `body_bytes` of data."""
         if self._request is not None:
             raise RuntimeError(f"{self.where}: a request is already under way")
         if not self.connected:
             raise LinkLost(self.where, "not connected")
         self._request = request = _Request(function, body, self._unit)
         self._body_bytes, self._skipped = body_bytes, 0
+        loop = asyncio.get_running_loop()
+        self._reply = loop.create_future()
+        overdue = loop.call_later(self._timeout_s, lambda: self._fail(self._overdue(function)))
         try:
-            reply = await self._client.execute(False, request)
-        except ModbusIOException:
-            raise self._overdue(function) from None
+            await self._client.execute(True, request)
+            answered, data = await self._reply
         finally:
+            overdue.cancel()
             self._request = None
-        if isinstance(reply, ExceptionResponse):
-            words = EXCEPTIONS.get(reply.exception_code, "unknown exception")
-            raise DeviceRefused(self.where, words, value=reply.exception_code)
-        same = reply.transaction_id == request.transaction_id and reply.dev_id == self._unit
-        if type(reply) is not _REPLIES[function] or not same:
-            raise BadReply(self.where, f"it does not fit function {function}", value=str(reply))
-        return reply.body
+        if answered != function:
+            raise DeviceRefused(self.where, EXCEPTIONS.get(data[0], "unknown exception"), value=data[0])
+        return data
 
     def _overdue(self, function: int) -> DeviceSilent | OutcomeUnknown:
         if function == READ:
@@ -172,7 +137,7 @@ class ModbusUnit:
         return OutcomeUnknown(self.where, f"No reply within {self._timeout_s} s.", value=f"write (function {function})")
 
     def _inspect(self, sending: bool, data: bytes) -> bytes:
-        """Pass on only the frame that answers the pending request, once it is whole and well formed."""
+        """Let pymodbus send, and keep what comes from it: the answer of the request is taken once it is whole."""
         request = self._request
         if sending or request is None:
             return data if sending else b""
@@ -185,8 +150,9 @@ class ModbusUnit:
             if end > len(data):
                 break
             if transaction == request.transaction_id:
-                complaint = self._complaint(request, unit, function, data[at + 8 : end])
-                return self._refuse(complaint) if complaint else data[at:end]
+                body = data[at + _MBAP.size : end]
+                complaint = self._complaint(request, unit, function, body)
+                return self._refuse(complaint) if complaint else self._take(function, body)
             # The buffer keeps what was skipped until the next request: count each stale frame once.
             if at >= self._skipped:
                 self.stale_replies += 1
@@ -207,6 +173,11 @@ class ModbusUnit:
             return f"{len(body) - counted} bytes of data instead of {self._body_bytes}"
         return ""
 
+    def _take(self, function: int, body: bytes) -> bytes:
+        if not self._reply.done():
+            self._reply.set_result((function, body))
+        return b""
+
     def _refuse(self, complaint: str) -> bytes:
         self._fail(BadReply(self.where, "The connection is not trusted any more.", value=complaint))
         return b""
@@ -217,9 +188,8 @@ class ModbusUnit:
 
     def _fail(self, error: Exception) -> None:
         """End the pending request at once."""
-        pending = self._client.ctx.response_future
-        if self._request is not None and not pending.done():
-            pending.set_exception(error)
+        if self._request is not None and not self._reply.done():
+            self._reply.set_exception(error)
 
 
 def _check(address: int, count: int, most: int) -> None:
