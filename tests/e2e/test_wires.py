@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from docking.journal import read, verify
-from tests.support.program import CELLS, PROGRAM, environment, quick_cell, served
+from tests.support.program import CELLS, PROGRAM, environment, on_an_ordinary_computer, quick_cell, served
 
 pytestmark = [pytest.mark.wires, pytest.mark.xdist_group("wires")]
 
@@ -59,7 +59,7 @@ def test_the_laboratory_cell_docks_over_real_wires(name: str, tmp_path: Path) ->
 def test_the_other_cells_dock_over_real_wires(name: str, tmp_path: Path, all_cells: bool) -> None:
     if not all_cells:
         pytest.skip("a quarter of an hour each; asked for by --all-cells (make wires)")
-    cell, journal = CELLS / f"{name}.toml", tmp_path / "run.jsonl"
+    cell, journal = on_an_ordinary_computer(tmp_path, name), tmp_path / "run.jsonl"
     with served(cell, tmp_path) as wires:
         summary = docked(cell, wires, journal, 2600.0)
     assert_docked_on_wires(summary, journal)

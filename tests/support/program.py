@@ -42,6 +42,20 @@ def quick_cell(folder: Path, name: str) -> Path:
     return cell_copy(folder, name, (".sim.toml", "measure_s = 0.1", "measure_s = 0.01"))
 
 
+def on_an_ordinary_computer(folder: Path, name: str) -> Path:
+    """A full-size cell whose controller and simulated devices may wait for the CPU, as the laboratory cells' may.
+
+    A production cell judges silence after 2 cycles of 10 ms; a virtual machine alone may take 50 ms away.
+    """
+    changes = [
+        (".toml", "\n[limits]\n", "\n[limits]\nmissing_cycles = 20\ntick_late_cycles = 20\n"),
+        (".sim.toml", 'sync_loss = "quick-stop"\n', 'sync_loss = "quick-stop"\nsync_loss_cycles = 25.0\n'),
+    ]
+    if name.endswith("-modbus"):
+        changes.append((".toml", "\ntimeout_s = 0.05\nwatchdog_s = 0.2\n", "\ntimeout_s = 0.2\nwatchdog_s = 0.5\n"))
+    return cell_copy(folder, name, *changes)
+
+
 @contextmanager
 def served(cell: Path, folder: Path, *options: str) -> Iterator[Path]:
     """`docking sim` in another process; gives its wires file. It ends on SIGTERM with exit code 0 and no complaint."""
