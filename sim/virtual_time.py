@@ -35,7 +35,6 @@ class _MemoryTransport(asyncio.Transport):
     def __init__(self, loop: VirtualTimeLoop, extra: dict[str, Any]) -> None:
         super().__init__(extra)
         self._loop = loop
-        self._pending: deque[bytes] = deque()
         self._closing = False
         self.protocol: asyncio.BaseProtocol
         self.peer: _MemoryTransport
@@ -43,11 +42,9 @@ class _MemoryTransport(asyncio.Transport):
     def write(self, data: bytes | bytearray | memoryview) -> None:
         if self._closing or not data:
             return
-        self._pending.append(bytes(data))
-        self._loop.call_later(LATENCY_S, self._deliver)
+        self._loop.call_later(LATENCY_S, self._deliver, bytes(data))
 
-    def _deliver(self) -> None:
-        data = self._pending.popleft()
+    def _deliver(self, data: bytes) -> None:
         if not self.peer._closing:
             self.peer.protocol.data_received(data)  # type: ignore[attr-defined]
 

@@ -44,7 +44,7 @@ class PlcGroup:
             PositionerPlc(p, Sensors(self._readings, i), trip_mm, loop.time, late_s[i])
             for i, p in enumerate(cell.positioners)
         )
-        self._rates = tuple(1.0 + 1e-6 * ppm for _, ppm in zip(self.plcs, clock_ppm, strict=True))
+        self._clocked = tuple((plc, 1.0 + 1e-6 * ppm) for plc, ppm in zip(self.plcs, clock_ppm, strict=True))
         self._driven = np.array(cell.driven, dtype=np.bool_)
         self._target_mm = np.array(plant.encoder_mm(), dtype=np.float64)
         self._powered = np.zeros(len(self._driven), dtype=np.bool_)
@@ -122,7 +122,7 @@ class PlcGroup:
         for plc in self.plcs:
             plc.think(now_s)
         line_high = all(plc.releases_run_line for plc in self.plcs)
-        for plc, rate in zip(self.plcs, self._rates, strict=True):
+        for plc, rate in self._clocked:
             plc.play(line_high, now_s, dt_s * rate)
         self._draw()
         self._plant.step(now_s, self._target_mm, self._powered, self._braked)
