@@ -186,6 +186,8 @@ def test_an_interrupted_rehearsal_exits_with_4() -> None:
         stderr=subprocess.PIPE,
         text=True,
         env=environment(),
+        # A test run in the background of a shell is born deaf to interrupts; a person's terminal is not.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as run:
         assert run.stdout is not None
         assert run.stderr is not None
