@@ -33,7 +33,7 @@ study: $(VENV)/.installed-dev
 	$(BIN)/docking study dock --seeds $(SEEDS)
 
 wires: $(VENV)/.installed-dev
-	$(BIN)/pytest -m wires tests/e2e --all-cells
+	$(BIN)/pytest -n 4 -m wires tests/e2e --all-cells
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
