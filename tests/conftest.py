@@ -11,6 +11,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--all-cells", action="store_true", help="dock the full-size cells over real wires too, in real time"
     )
+    parser.addoption("--full", action="store_true", help="the full sets of cases that are marked so, not only a few")
 
 
 @pytest.fixture
@@ -19,6 +20,17 @@ def all_cells(request: pytest.FixtureRequest) -> bool:
     return bool(request.config.getoption("--all-cells"))
 
 
-def pytest_configure() -> None:
+def pytest_configure(config: pytest.Config) -> None:
     """Begin without an event loop: pytest-asyncio would make one to restore, never close it, and warn of it."""
     asyncio.set_event_loop(None)
+    config.addinivalue_line("markers", "full: a case of a full set, run with --full only")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave the cases marked `full` out unless they are asked for."""
+    if config.getoption("--full"):
+        return
+    left_out = [item for item in items if item.get_closest_marker("full")]
+    if left_out:
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if not item.get_closest_marker("full")]
