@@ -155,6 +155,14 @@ class AxisNotEnabled(MotionError):
     code = 2114
 
 
+class MotionProcessLost(MotionError):
+    code = 2115
+
+
+class LeaseLost(MotionError):
+    code = 2116
+
+
 # 3xxx measuring and fitting --------------------------------------------------------------------------------------
 class PoseError(DockingError):
     """Measuring and fitting. `rejected` holds what the screening had found out about single points when it refused."""

@@ -68,6 +68,9 @@ class CanBus(Model):
     )
     map: str = Field(default="cia402", description="object map in drivers/maps")
     counts_per_mm: Positive = Field(default=10000.0, description="position units of the drives in one mm")
+    servo_lag_s: Annotated[float, Field(ge=0.0, le=0.1)] = Field(
+        default=0.002, description="following error of a healthy axis, divided by its speed, s"
+    )
 
 
 class ModbusBus(Model):
@@ -87,6 +90,12 @@ class ModbusBus(Model):
     )
     start_skew_s: NonNegative = Field(default=0.001, description="largest difference of the common start edge, s")
     clock_ppm: NonNegative = Field(default=50.0, description="largest deviation of a controller's clock, ppm")
+    scan_s: Annotated[float, Field(ge=0.001, le=0.1)] = Field(
+        default=0.01, description="scan of the controllers, compared with what they say of themselves, s"
+    )
+    servo_lag_s: Annotated[float, Field(ge=0.0, le=0.06)] = Field(
+        default=0.002, description="following error of a healthy axis, divided by its speed, s"
+    )
     map: str = Field(default="positioner_plc", description="register map in drivers/maps")
 
 
@@ -140,6 +149,11 @@ class LimitsConfig(Model):
     following_error_vmax_mm: Positive = Field(
         default=0.5, description="stop above it at full axis speed, in proportion below, mm"
     )
+    stuck_mm: Annotated[float, Field(ge=0.005, le=1.0)] = Field(
+        default=0.02,
+        description="an axis that hangs back by more than its lag while its encoder makes less than half of the "
+        "commanded step is stuck, mm",
+    )
     sync_error_mm: Positive = Field(
         default=0.05,
         description="how far positioners on clocks of their own may squeeze the ball figure on the way; bounds the "
@@ -186,6 +200,20 @@ class LimitsConfig(Model):
     )
 
 
+class MotionConfig(Model):
+    """The motion process: how long it goes on alone, how often it reports, how it judges its own punctuality."""
+
+    lease_s: Annotated[float, Field(ge=0.1, le=5.0)] = Field(
+        default=0.5, description="the axes stop on the path when the cell process is silent this long, s"
+    )
+    feedback_s: Annotated[float, Field(ge=0.01, le=0.5)] = Field(
+        default=0.05, description="period of the read-backs that the cell process gets, s"
+    )
+    lateness_s: Annotated[float, Field(ge=0.1, le=60.0)] = Field(
+        default=3.0, description="how long the motion process measures its own lateness before it connects, s"
+    )
+
+
 class CellFile(Model):
     """A docking cell: instrument, positioners, bus, limits."""
 
@@ -201,6 +229,7 @@ class CellFile(Model):
     temperature_c: Finite = Field(default=20.0, description="reference temperature of all nominal coordinates, deg C")
     limits: LimitsConfig = Field(default=LimitsConfig(), description="where the cell stops or refuses")
     settle: SettleConfig = Field(default=SettleConfig(), description="standstill before measuring")
+    motion: MotionConfig = Field(default=MotionConfig(), description="the process that moves the axes")
     permissives: tuple[Name, ...] = Field(default=(), description="named inputs the cell offers")
 
     @property
