@@ -258,7 +258,8 @@ class Feedback:
 
     `position_mm` (m,), `following_error_mm` (m,), `force_n` (m,) load on each axis along itself (NaN where no load
     cell); `age_cycles` (m,) cycles since each axis last reported; `fraction_s` path time that a queue-playing device
-    reports (NaN where the host streams). `fault` is None or (axis, code, text) of the first axis in fault.
+    reports (NaN where the host streams). `fault` is None or (axis, code, text) of the first axis in fault; `at_limit`
+    (m,) the limit switches that are pressed, None where none are read.
     """
 
     t_s: float
@@ -269,6 +270,7 @@ class Feedback:
     age_cycles: Array
     path_time_s: float = float("nan")
     fault: tuple[str, int, str] | None = None
+    at_limit: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
