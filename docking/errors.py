@@ -163,6 +163,46 @@ class LeaseLost(MotionError):
     code = 2116
 
 
+class AxisStuck(MotionError):
+    code = 2121
+
+
+class AxisDrift(MotionError):
+    code = 2122
+
+
+class AxisAtLimit(MotionError):
+    code = 2123
+
+
+class EncoderJump(MotionError):
+    code = 2124
+
+
+class PassiveAxisTrip(MotionError):
+    code = 2125
+
+
+class MeasuredForceTrip(MotionError):
+    code = 2126
+
+
+class MeasuredWarpTrip(MotionError):
+    code = 2127
+
+
+class BallUnloaded(MotionError):
+    code = 2128
+
+
+class LoadCellSilent(MotionError):
+    code = 2129
+
+
+class DriveWarning(MotionError):
+    code = 2130
+
+
 # 3xxx measuring and fitting --------------------------------------------------------------------------------------
 class PoseError(DockingError):
     """Measuring and fitting. `rejected` holds what the screening had found out about single points when it refused."""

@@ -252,14 +252,24 @@ class AxisState(Enum):
     FAULT = "fault"
 
 
+class FaultKind(Enum):
+    """What `Feedback.fault` is about."""
+
+    DRIVE_FAULT = "the drive is in fault"
+    DRIVE_WARNING = "the drive complains and goes on"
+    NODE_RESTARTED = "the device restarted or left its operational state"
+    HEARTBEAT_LOST = "the device fell silent"
+    FOREIGN_SENDER = "somebody else commands the device"
+
+
 @dataclass(frozen=True, eq=False)
 class Feedback:
     """One read-back of all axes (order of the cell file). Not copied: made once a cycle by a driver.
 
     `position_mm` (m,), `following_error_mm` (m,), `force_n` (m,) load on each axis along itself (NaN where no load
     cell); `age_cycles` (m,) cycles since each axis last reported; `fraction_s` path time that a queue-playing device
-    reports (NaN where the host streams). `fault` is None or (axis, code, text) of the first axis in fault; `at_limit`
-    (m,) the limit switches that are pressed, None where none are read.
+    reports (NaN where the host streams). `fault` is None or (axis, code, text) of the first axis in fault and
+    `fault_kind` says what about; `at_limit` (m,) are the axes that report a limit, None where none does.
     """
 
     t_s: float
@@ -271,6 +281,7 @@ class Feedback:
     path_time_s: float = float("nan")
     fault: tuple[str, int, str] | None = None
     at_limit: NDArray[np.bool_] | None = None
+    fault_kind: FaultKind = FaultKind.DRIVE_FAULT
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from docking.errors import (
     WarpTrip,
 )
 from docking.kinematics import CouplingMonitor, Positioners, coupling_monitor, socket_positions
+from docking.motion.triggers import Finding, Trigger
 from docking.types import Array, AxisState, Feedback, Plan
 
 LATE_IN_A_ROW = 2
@@ -90,22 +91,29 @@ class Watch:
         return None
 
     def evaluate(
-        self, feedback: Feedback, q_ref_mm: Array, speed_mm_s: Array | float, *, may_stop: bool = False
-    ) -> MotionError | None:
+        self,
+        feedback: Feedback,
+        q_ref_mm: Array,
+        speed_mm_s: Array | float,
+        *,
+        moving: bool,
+        may_stop: bool = False,
+    ) -> Finding | None:
         """The first violated limit, or None. `q_ref_mm` (m,) is the rigid figure the read-back belongs to.
 
-        `may_stop` says that an axis may be ramping down by itself, as a device does that was told to stop.
+        `moving` says that a move runs; `may_stop` says that an axis may be ramping down by itself, as a device does that was told to stop.
         """
         if feedback.fault is not None:
             axis, code, text = feedback.fault
-            return DriveFault(axis, text, value=code)
+            return Finding(Trigger[feedback.fault_kind.name], DriveFault(axis, text, value=code))
         worst_age = feedback.age_cycles.max()
         if not (worst_age <= self._limits.missing_cycles):
             axis = self._axes[int(np.argmax(feedback.age_cycles))]
-            return FeedbackMissing(axis, value=float(worst_age), limit=self._limits.missing_cycles)
+            error = FeedbackMissing(axis, value=float(worst_age), limit=self._limits.missing_cycles)
+            return Finding(Trigger.FEEDBACK_MISSING, error)
         off = self.power(feedback, may_stop=may_stop)
         if off is not None:
-            return off
+            return Finding(Trigger.AXIS_OFF, off)
         if worst_age > 0.0:
             return self._judge_late(feedback, q_ref_mm, speed_mm_s)
         self._late_in_a_row = 0
@@ -115,7 +123,7 @@ class Watch:
             or self._ball_forces(feedback.force_n)
         )
 
-    def _judge_late(self, feedback: Feedback, q_ref_mm: Array, speed_mm_s: Array | float) -> MotionError | None:
+    def _judge_late(self, feedback: Feedback, q_ref_mm: Array, speed_mm_s: Array | float) -> Finding | None:
         """Judge without the figure, a few times: a late read-back beside fresh ones would look like a squeezed part."""
         self._late_in_a_row += 1
         trip = self._following(feedback.following_error_mm, speed_mm_s) or self._ball_forces(feedback.force_n)
@@ -125,9 +133,10 @@ class Watch:
             return None
         axis = self._axes[int(np.argmax(feedback.age_cycles))]
         cause = f"{axis} has not reported for {feedback.age_cycles.max():.0f} cycles."
-        return type(trip)(trip.where, cause, value=trip.value, limit=trip.limit)
+        error = trip.error
+        return Finding(trip.trigger, type(error)(error.where, cause, value=error.value, limit=error.limit))
 
-    def _following(self, error_mm: Array, speed_mm_s: Array | float) -> MotionError | None:
+    def _following(self, error_mm: Array, speed_mm_s: Array | float) -> Finding | None:
         magnitude = np.abs(error_mm)
         np.maximum(self.max_following_mm, magnitude, out=self.max_following_mm)
         limit = self._limits.following_rest_mm + self._following_slope * np.abs(speed_mm_s)
@@ -135,9 +144,10 @@ class Watch:
         if inside.all():
             return None
         k = int(np.argmin(inside))
-        return FollowingErrorTrip(self._axes[k], value=float(error_mm[k]), limit=float(limit[k]))
+        error = FollowingErrorTrip(self._axes[k], value=float(error_mm[k]), limit=float(limit[k]))
+        return Finding(Trigger.FOLLOWING_ERROR, error)
 
-    def _figure(self, position_mm: Array, q_ref_mm: Array) -> MotionError | None:
+    def _figure(self, position_mm: Array, q_ref_mm: Array) -> Finding | None:
         if self._coupling is None:
             return None
         off_mm = position_mm - q_ref_mm
@@ -147,11 +157,16 @@ class Watch:
         self.max_internal_force_n = max(self.max_internal_force_n, force)
         limits = self._limits
         if not (residual <= limits.ball_residual_mm):
-            return ConsistencyTrip("ball centres", self._worst(off_mm), value=residual, limit=limits.ball_residual_mm)
+            limit = limits.ball_residual_mm
+            error: MotionError = ConsistencyTrip("ball centres", self._worst(off_mm), value=residual, limit=limit)
+            return Finding(Trigger.COUPLING, error)
         if not (force <= limits.internal_force_n):
-            return InternalForceTrip("ball centres", self._worst(off_mm), value=force, limit=limits.internal_force_n)
+            limit = limits.internal_force_n
+            error = InternalForceTrip("ball centres", self._worst(off_mm), value=force, limit=limit)
+            return Finding(Trigger.PREDICTED_FORCE, error)
         if not (abs(warp) <= limits.warp_force_n):
-            return WarpTrip("Z axes", self._worst(off_mm), value=warp, limit=limits.warp_force_n)
+            error = WarpTrip("Z axes", self._worst(off_mm), value=warp, limit=limits.warp_force_n)
+            return Finding(Trigger.PREDICTED_WARP, error)
         return None
 
     def _worst(self, off_mm: Array) -> str:
@@ -159,10 +174,11 @@ class Watch:
         k = int(np.argmax(np.abs(off_mm)))
         return f"{self._axes[k]} is {off_mm[k]:+.3f} mm from its place."
 
-    def _ball_forces(self, force_n: Array) -> MotionError | None:
+    def _ball_forces(self, force_n: Array) -> Finding | None:
         over = ~(np.abs(force_n) <= self._rated_n) & self._weighed
         if not over.any():
             return None
         k = int(np.argmax(over))
         cause = "Its load cell does not report." if np.isnan(force_n[k]) else ""
-        return BallForceTrip(self._axes[k], cause, value=float(force_n[k]), limit=float(self._rated_n[k]))
+        error = BallForceTrip(self._axes[k], cause, value=float(force_n[k]), limit=float(self._rated_n[k]))
+        return Finding(Trigger.FORCE_MISSING if cause else Trigger.OVERLOAD, error)

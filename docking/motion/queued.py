@@ -146,13 +146,13 @@ class QueuedMotion:
         self._feedback = feedback
         may_stop = self._may_stop(feedback)
         if playback is None:
-            cause = self._watch.evaluate(feedback, self._commanded, 0.0, may_stop=may_stop)
+            finding = self._watch.evaluate(feedback, self._commanded, 0.0, moving=False, may_stop=may_stop)
         else:
             at = feedback.path_time_s
             chord, speed = playback.chord_at(at), playback.speed_at(at)
-            cause = self._watch.evaluate(feedback, chord, speed, may_stop=may_stop)
-        if cause is not None and self._cause is None:
-            self._cause = cause
+            finding = self._watch.evaluate(feedback, chord, speed, moving=self._moving, may_stop=may_stop)
+        if finding is not None and self._cause is None:
+            self._cause = finding.error
             if self._moving:
                 await self._command("stop")
         return feedback

@@ -13,6 +13,7 @@ from docking.errors import AxisNotEnabled, Defect, DockingError, DriveFault, Fee
 from docking.motion.monitors import Watch
 from docking.motion.playback import Playback
 from docking.motion.recorder import Recorder
+from docking.motion.triggers import Finding
 from docking.ports import StreamedPositioners
 from docking.types import Array, Feedback, Identity, MoveResult, Plan, readonly
 
@@ -199,10 +200,10 @@ class StreamedMotion:
             before, self._judged = self._judged, feedback
             if before is not None and _same(before, feedback) and self._history[0] is self._setpoint:
                 return None
-            return self._watch.evaluate(feedback, self._history[0], 0.0)
+            return _error_of(self._watch.evaluate(feedback, self._history[0], 0.0, moving=False))
         # A read-back belongs to the set-point of two cycles ago: one cycle on the bus, one until the drive applies it.
         speed = move.playback.speed_at(move.playback.path_time_s)
-        return self._watch.evaluate(feedback, self._history[0], speed)
+        return _error_of(self._watch.evaluate(feedback, self._history[0], speed, moving=True))
 
     def _lateness(self, late_s: float) -> DockingError | None:
         limit = self._late_limit_s
@@ -236,6 +237,10 @@ class StreamedMotion:
     def _end(self, move: _Move) -> None:
         self._move = None
         move.over.set()
+
+
+def _error_of(finding: Finding | None) -> DockingError | None:
+    return None if finding is None else finding.error
 
 
 def _same(before: Feedback, now: Feedback) -> bool:

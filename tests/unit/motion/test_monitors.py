@@ -37,6 +37,12 @@ def rc1_watch(limits=LIMITS):
     return watch
 
 
+def judge(watch, feedback, q_ref_mm, speed_mm_s, may_stop=False):
+    """The error of what the watch finds, or None."""
+    finding = watch.evaluate(feedback, q_ref_mm, speed_mm_s, moving=True, may_stop=may_stop)
+    return None if finding is None else finding.error
+
+
 def weighing_watch():
     """RC-1 with a load cell under each ball but D's."""
     watch = watch_of(rc1(), load_cells=[True] * 9 + [False] * 3)
@@ -60,7 +66,7 @@ def pattern(axis: int, a: float, b: float, c: float, d: float):
 
 def test_a_healthy_read_back_trips_nothing():
     watch = rc1_watch()
-    assert watch.evaluate(read_back(Q), Q, 0.0) is None
+    assert judge(watch, read_back(Q), Q, 0.0) is None
     assert (watch.max_residual_mm, watch.max_internal_force_n) == (0.0, 0.0)
 
 
@@ -69,9 +75,9 @@ def test_a_healthy_read_back_trips_nothing():
 def test_following_error_at_rest(row, sign):
     errors = np.zeros(12)
     errors[row] = sign * 0.0999
-    assert rc1_watch().evaluate(read_back(Q, following_error_mm=errors), Q, 0.0) is None
+    assert judge(rc1_watch(), read_back(Q, following_error_mm=errors), Q, 0.0) is None
     errors[row] = sign * 0.1001
-    trip = rc1_watch().evaluate(read_back(Q, following_error_mm=errors), Q, 0.0)
+    trip = judge(rc1_watch(), read_back(Q, following_error_mm=errors), Q, 0.0)
     assert isinstance(trip, FollowingErrorTrip)
     assert trip.where == AXES[row]
     assert trip.value == pytest.approx(sign * 0.1001)
@@ -84,14 +90,14 @@ def test_following_error_is_allowed_to_grow_with_the_speed_of_its_own_axis(speed
     speeds[4] = speed
     errors = np.zeros(12)
     errors[4] = limit - 0.001
-    assert rc1_watch().evaluate(read_back(Q, following_error_mm=errors), Q, speeds) is None
+    assert judge(rc1_watch(), read_back(Q, following_error_mm=errors), Q, speeds) is None
     errors[4] = limit + 0.001
-    trip = rc1_watch().evaluate(read_back(Q, following_error_mm=errors), Q, speeds)
+    trip = judge(rc1_watch(), read_back(Q, following_error_mm=errors), Q, speeds)
     assert isinstance(trip, FollowingErrorTrip)
     assert trip.where == "B.Y"
     speeds[:] = (10.0,) * 12
     speeds[4] = speed
-    assert isinstance(rc1_watch().evaluate(read_back(Q, following_error_mm=errors), Q, speeds), FollowingErrorTrip)
+    assert isinstance(judge(rc1_watch(), read_back(Q, following_error_mm=errors), Q, speeds), FollowingErrorTrip)
 
 
 def test_a_passive_axis_has_no_set_point_to_follow():
@@ -101,14 +107,14 @@ def test_a_passive_axis_has_no_set_point_to_follow():
     watch.watch_about(Q)
     errors = np.zeros(12)
     errors[3] = 5.0
-    assert watch.evaluate(read_back(Q, following_error_mm=errors), Q, 0.0) is None
+    assert judge(watch, read_back(Q, following_error_mm=errors), Q, 0.0) is None
 
 
 @pytest.mark.parametrize("row", range(12))
 def test_nan_in_any_following_error_trips(row):
     errors = np.zeros(12)
     errors[row] = np.nan
-    trip = rc1_watch(WIDE).evaluate(read_back(Q, following_error_mm=errors), Q, 0.0)
+    trip = judge(rc1_watch(WIDE), read_back(Q, following_error_mm=errors), Q, 0.0)
     assert isinstance(trip, FollowingErrorTrip)
     assert trip.where == AXES[row]
 
@@ -117,7 +123,7 @@ def test_nan_in_any_following_error_trips(row):
 def test_nan_in_any_position_trips(row):
     position = np.zeros(12)
     position[row] = np.nan
-    assert isinstance(rc1_watch(WIDE).evaluate(read_back(position), Q, 0.0), ConsistencyTrip)
+    assert isinstance(judge(rc1_watch(WIDE), read_back(position), Q, 0.0), ConsistencyTrip)
 
 
 @pytest.mark.parametrize("axis", [0, 1])
@@ -125,9 +131,9 @@ def test_a_stretched_figure_trips_on_its_residual(axis):
     # A and B lie at -3000 and 3000 along X, D and C likewise; A, D and B, C at -1800 and 1800 along Y.
     stretch = (-1.0, 1.0, 1.0, -1.0) if axis == 0 else (-1.0, -1.0, 1.0, 1.0)
     watch = rc1_watch(replace(WIDE, ball_residual_mm=0.1))
-    assert watch.evaluate(read_back(pattern(axis, *np.multiply(0.0999, stretch))), Q, 0.0) is None
+    assert judge(watch, read_back(pattern(axis, *np.multiply(0.0999, stretch))), Q, 0.0) is None
     assert watch.residual_mm == pytest.approx(0.0999, rel=1e-9)
-    trip = watch.evaluate(read_back(pattern(axis, *np.multiply(0.1001, stretch))), Q, 0.0)
+    trip = judge(watch, read_back(pattern(axis, *np.multiply(0.1001, stretch))), Q, 0.0)
     assert isinstance(trip, ConsistencyTrip)
     assert trip.value == pytest.approx(0.1001, rel=1e-9)
     assert trip.limit == pytest.approx(0.1)
@@ -136,8 +142,8 @@ def test_a_stretched_figure_trips_on_its_residual(axis):
 def test_a_stretched_figure_trips_on_the_force_that_it_means():
     watch = rc1_watch(replace(WIDE, internal_force_n=1500.0))
     under, over = 0.99 * 1500.0 / K, 1.01 * 1500.0 / K
-    assert watch.evaluate(read_back(pattern(0, -under, under, under, -under)), Q, 0.0) is None
-    trip = watch.evaluate(read_back(pattern(0, -over, over, over, -over)), Q, 0.0)
+    assert judge(watch, read_back(pattern(0, -under, under, under, -under)), Q, 0.0) is None
+    trip = judge(watch, read_back(pattern(0, -over, over, over, -over)), Q, 0.0)
     assert isinstance(trip, InternalForceTrip)
     assert trip.value == pytest.approx(1.01 * 1500.0, rel=1e-6)
     assert watch.max_internal_force_n == pytest.approx(1.01 * 1500.0, rel=1e-6)
@@ -147,25 +153,25 @@ def test_a_stretched_figure_trips_on_the_force_that_it_means():
 def test_a_twisted_table_trips_on_warp(sign):
     watch = rc1_watch(replace(WIDE, warp_force_n=300.0))
     under, over = sign * 0.99 * 300.0 / K, sign * 1.01 * 300.0 / K
-    assert watch.evaluate(read_back(pattern(2, under, -under, under, -under)), Q, 0.0) is None
-    trip = watch.evaluate(read_back(pattern(2, over, -over, over, -over)), Q, 0.0)
+    assert judge(watch, read_back(pattern(2, under, -under, under, -under)), Q, 0.0) is None
+    trip = judge(watch, read_back(pattern(2, over, -over, over, -over)), Q, 0.0)
     assert isinstance(trip, WarpTrip)
     assert abs(trip.value) == pytest.approx(1.01 * 300.0, rel=1e-6)
 
 
 def test_deviations_that_move_the_whole_figure_are_no_coupling():
     watch = rc1_watch(replace(WIDE, ball_residual_mm=1e-3, internal_force_n=1.0, warp_force_n=1.0))
-    assert watch.evaluate(read_back(np.tile([0.7, -0.4, 0.9], 4)), Q, 0.0) is None
+    assert judge(watch, read_back(np.tile([0.7, -0.4, 0.9], 4)), Q, 0.0) is None
     tilt = pattern(2, -0.03, 0.03, 0.03, -0.03)
     tilt += pattern(0, *np.multiply(0.03 / 3000.0, (0.0, 0.0, 0.0, 0.0)))
-    assert watch.evaluate(read_back(tilt), Q, 0.0) is None
+    assert judge(watch, read_back(tilt), Q, 0.0) is None
 
 
 def test_the_figure_is_judged_against_the_reference_it_belongs_to():
     watch = rc1_watch(replace(WIDE, ball_residual_mm=0.1))
     there = pattern(0, -3.0, 3.0, 3.0, -3.0)
-    assert watch.evaluate(read_back(there), there, 0.0) is None
-    assert isinstance(watch.evaluate(read_back(there), Q, 0.0), ConsistencyTrip)
+    assert judge(watch, read_back(there), there, 0.0) is None
+    assert isinstance(judge(watch, read_back(there), Q, 0.0), ConsistencyTrip)
 
 
 def test_one_axis_out_in_a_crooked_cell_leaves_what_a_rigid_fit_leaves():
@@ -181,7 +187,7 @@ def test_one_axis_out_in_a_crooked_cell_leaves_what_a_rigid_fit_leaves():
     moves = [np.tile(unit, (4, 1)) for unit in np.eye(3)] + [np.cross(unit, arms) for unit in np.eye(3)]
     rigid = np.array([move.reshape(-1) for move in moves]).T
     left = off - rigid @ np.linalg.lstsq(rigid, off, rcond=None)[0]
-    watch.evaluate(read_back(out), Q, 0.0)
+    judge(watch, read_back(out), Q, 0.0)
     assert watch.residual_mm == pytest.approx(np.linalg.norm(left.reshape(4, 3), axis=1).max(), rel=1e-6)
     assert 0.01 < watch.residual_mm < 0.05
 
@@ -189,13 +195,13 @@ def test_one_axis_out_in_a_crooked_cell_leaves_what_a_rigid_fit_leaves():
 def test_silence_longer_than_the_limit_trips_and_names_the_axis():
     age = np.zeros(12)
     age[8] = 2.0
-    assert rc1_watch().evaluate(read_back(Q, age_cycles=age), Q, 0.0) is None
+    assert judge(rc1_watch(), read_back(Q, age_cycles=age), Q, 0.0) is None
     age[8] = 3.0
-    trip = rc1_watch().evaluate(read_back(Q, age_cycles=age), Q, 0.0)
+    trip = judge(rc1_watch(), read_back(Q, age_cycles=age), Q, 0.0)
     assert isinstance(trip, FeedbackMissing)
     assert (trip.where, trip.value, trip.limit) == ("C.Z", 3.0, 2)
     age[8] = np.nan
-    trip = rc1_watch(WIDE).evaluate(read_back(Q, age_cycles=age), Q, 0.0)
+    trip = judge(rc1_watch(WIDE), read_back(Q, age_cycles=age), Q, 0.0)
     assert isinstance(trip, FeedbackMissing)
     assert trip.where == "C.Z"
 
@@ -203,7 +209,7 @@ def test_silence_longer_than_the_limit_trips_and_names_the_axis():
 def test_a_fault_of_a_drive_comes_before_what_follows_from_it():
     errors = np.full(12, 9.0)
     told = read_back(Q, fault=("D.Y", 0x7305, "encoder"), following_error_mm=errors)
-    trip = rc1_watch().evaluate(told, Q, 0.0)
+    trip = judge(rc1_watch(), told, Q, 0.0)
     assert isinstance(trip, DriveFault)
     assert (trip.where, trip.value, trip.cause) == ("D.Y", 0x7305, "encoder")
 
@@ -212,9 +218,9 @@ def test_a_fault_of_a_drive_comes_before_what_follows_from_it():
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_an_overloaded_ball_trips_and_names_the_axis(row, rated, sign):
     force = forces(row, sign * 1.0999 * rated)
-    assert weighing_watch().evaluate(read_back(Q, force_n=force), Q, 0.0) is None
+    assert judge(weighing_watch(), read_back(Q, force_n=force), Q, 0.0) is None
     force = forces(row, sign * 1.1001 * rated)
-    trip = weighing_watch().evaluate(read_back(Q, force_n=force), Q, 0.0)
+    trip = judge(weighing_watch(), read_back(Q, force_n=force), Q, 0.0)
     assert isinstance(trip, BallForceTrip)
     assert trip.where == AXES[row]
     assert trip.limit == pytest.approx(1.1 * rated)
@@ -222,7 +228,7 @@ def test_an_overloaded_ball_trips_and_names_the_axis(row, rated, sign):
 
 @pytest.mark.parametrize("row", range(9))
 def test_a_load_cell_that_does_not_report_trips(row):
-    trip = weighing_watch().evaluate(read_back(Q, force_n=forces(row, np.nan)), Q, 0.0)
+    trip = judge(weighing_watch(), read_back(Q, force_n=forces(row, np.nan)), Q, 0.0)
     assert isinstance(trip, BallForceTrip)
     assert trip.where == AXES[row]
     assert "does not report" in trip.text()
@@ -235,16 +241,16 @@ def test_a_driven_axis_that_is_not_enabled_trips(row, state):
     states[row] = state
     watch = rc1_watch()
     told = read_back(Q, states=tuple(states))
-    trip = watch.evaluate(told, Q, 0.0)
+    trip = judge(watch, told, Q, 0.0)
     assert isinstance(trip, AxisNotEnabled)
     assert (trip.where, trip.value, trip.limit) == (AXES[row], state.value, "enabled")
     stopping = state is AxisState.STOPPING
-    assert (watch.evaluate(told, Q, 0.0, may_stop=True) is None) == stopping
+    assert (judge(watch, told, Q, 0.0, may_stop=True) is None) == stopping
     # What was let pass once is judged again when no stop is under way.
-    assert isinstance(watch.evaluate(told, Q, 0.0), AxisNotEnabled)
+    assert isinstance(judge(watch, told, Q, 0.0), AxisNotEnabled)
     late = np.zeros(12)
     late[3] = 1.0
-    assert isinstance(watch.evaluate(read_back(Q, states=tuple(states), age_cycles=late), Q, 0.0), AxisNotEnabled)
+    assert isinstance(judge(watch, read_back(Q, states=tuple(states), age_cycles=late), Q, 0.0), AxisNotEnabled)
 
 
 def test_a_passive_axis_is_never_enabled():
@@ -254,13 +260,13 @@ def test_a_passive_axis_is_never_enabled():
     watch.watch_about(Q)
     states = [AxisState.ENABLED] * 12
     states[3] = AxisState.DISABLED
-    assert watch.evaluate(read_back(Q, states=tuple(states)), Q, 0.0) is None
+    assert judge(watch, read_back(Q, states=tuple(states)), Q, 0.0) is None
 
 
 def test_maxima_are_kept_until_the_next_move():
     watch = rc1_watch()
-    watch.evaluate(read_back(pattern(0, -0.02, 0.02, 0.02, -0.02), following_error_mm=np.full(12, -0.05)), Q, 0.0)
-    watch.evaluate(read_back(Q), Q, 0.0)
+    judge(watch, read_back(pattern(0, -0.02, 0.02, 0.02, -0.02), following_error_mm=np.full(12, -0.05)), Q, 0.0)
+    judge(watch, read_back(Q), Q, 0.0)
     assert watch.max_residual_mm == pytest.approx(0.02)
     assert watch.max_internal_force_n == pytest.approx(0.02 * K)
     np.testing.assert_allclose(watch.max_following_mm, 0.05)
@@ -273,7 +279,7 @@ def test_maxima_are_kept_until_the_next_move():
 def test_a_coupling_trip_names_the_axis_that_is_out_of_its_place(row):
     out = np.zeros(12)
     out[row] = -0.5
-    trip = rc1_watch().evaluate(read_back(out), Q, 0.0)
+    trip = judge(rc1_watch(), read_back(out), Q, 0.0)
     assert AXES[row] in trip.text()
     assert "-0.500 mm" in trip.text()
 
@@ -284,9 +290,9 @@ def test_a_late_read_back_is_no_squeezed_part_but_is_told_with_what_else_trips()
     moved[4] = 0.0
     age = np.zeros(12)
     age[4] = 2.0
-    assert isinstance(watch.evaluate(read_back(moved), Q, 0.0), ConsistencyTrip)
-    assert watch.evaluate(read_back(moved, age_cycles=age, force_n=forces(1, 0.0)), Q, 0.0) is None
-    trip = watch.evaluate(read_back(moved, age_cycles=age, force_n=forces(1, 20000.0)), Q, 0.0)
+    assert isinstance(judge(watch, read_back(moved), Q, 0.0), ConsistencyTrip)
+    assert judge(watch, read_back(moved, age_cycles=age, force_n=forces(1, 0.0)), Q, 0.0) is None
+    trip = judge(watch, read_back(moved, age_cycles=age, force_n=forces(1, 20000.0)), Q, 0.0)
     assert isinstance(trip, BallForceTrip)
     assert trip.where == "A.Y"
     assert "B.Y has not reported for 2 cycles" in trip.text()
@@ -300,16 +306,16 @@ def test_the_figure_is_left_unjudged_for_two_cycles_in_a_row_at_most():
     age[4] = 1.0
     late, fresh = read_back(squeezed, age_cycles=age), read_back(Q)
     for _ in range(3):
-        assert [watch.evaluate(late, Q, 0.0) for _ in range(2)] == [None, None]
-        assert watch.evaluate(fresh, Q, 0.0) is None
-    assert [watch.evaluate(late, Q, 0.0) for _ in range(2)] == [None, None]
-    trip = watch.evaluate(late, Q, 0.0)
+        assert [judge(watch, late, Q, 0.0) for _ in range(2)] == [None, None]
+        assert judge(watch, fresh, Q, 0.0) is None
+    assert [judge(watch, late, Q, 0.0) for _ in range(2)] == [None, None]
+    trip = judge(watch, late, Q, 0.0)
     assert isinstance(trip, ConsistencyTrip)
     assert "B.Y has not reported for 1 cycles" in trip.text()
     # All late alike: the figure as it was, somewhere along the path.
     watch = rc1_watch(replace(LIMITS, missing_cycles=20))
     behind = read_back(np.tile([-0.3, 0.1, 0.2], 4), age_cycles=np.ones(12))
-    assert [watch.evaluate(behind, Q, 0.0) for _ in range(10)] == [None] * 10
+    assert [judge(watch, behind, Q, 0.0) for _ in range(10)] == [None] * 10
 
 
 def test_a_fault_may_stop_a_plan_as_hard_as_the_axes_can():

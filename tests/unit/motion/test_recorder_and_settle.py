@@ -25,7 +25,7 @@ def recorded(every: int, count: int):
     for i in range(count):
         q = np.arange(12.0) + i
         told = read_back(q, t_s=0.01 * i, following_error_mm=np.full(12, 0.001 * i), force_n=np.full(12, 10.0 * i))
-        watch.evaluate(told, q, 0.0)
+        watch.evaluate(told, q, 0.0, moving=True)
         recorder.add(told, 0.02 * i)
     return recorder.result("done", 0.02 * count, np.arange(12.0), None)
 
