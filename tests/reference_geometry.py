@@ -60,6 +60,7 @@ def three_positioners() -> Positioners:
     whole = rc1()
     by_ball = ("origins_W_mm", "axes_W", "stiffness_n_per_mm", "rated_n", "swivel_rad", "balls_C_mm")
     by_axis = ("axes", "driven", "stroke_mm", "v_mm_s", "a_mm_s2", "j_mm_s3", "a_quick_mm_s2")
+    by_axis += ("held_n", "held_tolerance_n")
     parts = {name: getattr(whole, name)[:3] for name in by_ball} | {name: getattr(whole, name)[:9] for name in by_axis}
     return replace(whole, names=whole.names[:3], **parts)
 

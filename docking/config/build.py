@@ -42,6 +42,8 @@ def _positioners(cell: CellFile, balls_C_mm: Array, neutral_R_WC: Array) -> Posi
         origins_W_mm=np.array([station.origin_mm for station in stations]),
         axes_W=np.array([np.transpose([axis.direction for axis in station.axes]) for station in stations]),
         driven=np.array(cell.driven),
+        held_n=np.array([axis.force_n or 0.0 for axis in axes]),
+        held_tolerance_n=np.array([axis.force_tolerance * (axis.force_n or 0.0) for axis in axes]),
         stroke_mm=np.array([axis.stroke_mm for axis in axes]),
         v_mm_s=np.array([axis.v_mm_s for axis in axes]),
         a_mm_s2=np.array([axis.a_mm_s2 for axis in axes]),

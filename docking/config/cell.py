@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from docking.config.base import Finite, Fraction, Model, Name, NonNegative, PoseVector, Positive, Vector3
 
@@ -106,12 +106,33 @@ class AxisConfig(Model):
         default=None, description="expected serial number of the drive (1018h:04); any when left out"
     )
     direction: Vector3 = Field(description="real axis direction times scale, in W")
-    driven: bool = Field(default=True, description="false: follows without power, its encoder is read")
+    driven: bool = Field(
+        default=True, description="true: holds a position; false: follows the component, its encoder is read"
+    )
+    force_n: Positive | None = Field(
+        default=None,
+        description="an axis that is not driven holds this force against gravity, N; without it, it follows unpowered",
+    )
+    force_tolerance: Annotated[float, Field(gt=0.0, le=0.2)] = Field(
+        default=0.02, description="largest deviation of the held force, as a fraction of it"
+    )
     stroke_mm: tuple[Finite, Finite] = Field(description="lower and upper end, mm")
     v_mm_s: Positive = Field(description="largest speed, mm/s")
     a_mm_s2: Positive = Field(description="largest acceleration, mm/s^2")
     j_mm_s3: Positive = Field(description="largest jerk, mm/s^3")
     a_quick_mm_s2: Positive = Field(description="quick-stop deceleration, mm/s^2")
+
+    @model_validator(mode="after")
+    def _force_instead_of_position(self) -> Self:
+        """An axis that holds a force holds no position."""
+        if self.force_n is not None and self.driven:
+            raise ValueError("an axis with force_n holds no position: set driven = false")
+        return self
+
+    @property
+    def powered(self) -> bool:
+        """True for an axis under power: it holds a position or a force."""
+        return self.driven or self.force_n is not None
 
 
 class PositionerConfig(Model):
@@ -239,4 +260,10 @@ class CellFile(Model):
 
     @property
     def driven(self) -> tuple[bool, ...]:
+        """Which axes hold a position."""
         return tuple(a.driven for p in self.positioners for a in p.axes)
+
+    @property
+    def powered(self) -> tuple[bool, ...]:
+        """Which axes are under power: those that hold a position and those that hold a force."""
+        return tuple(a.powered for p in self.positioners for a in p.axes)

@@ -14,7 +14,13 @@ from docking.config.document import cell_document_findings, job_document_finding
 from docking.config.findings import Finding, error, errors_of, warning
 from docking.config.job import JobFile, Target
 from docking.config.nominal import feature_points, mate_feature_points
-from docking.config.support import rank_findings, reaction_findings, speed_findings, stroke_findings
+from docking.config.support import (
+    follower_findings,
+    rank_findings,
+    reaction_findings,
+    speed_findings,
+    stroke_findings,
+)
 from docking.errors import DockingError
 from docking.pose.layout import spread
 from docking.pose.settings import FitSettings
@@ -36,7 +42,7 @@ def check_cell(cell: CellFile) -> list[Finding]:
     axes = list(chain.from_iterable(_directions(i, p) for i, p in enumerate(cell.positioners)))
     findings += axes
     if not errors_of(axes):
-        findings += _computed("positioners", lambda: rank_findings(cell))
+        findings += _computed("positioners", lambda: rank_findings(cell) + follower_findings(cell))
     return findings
 
 

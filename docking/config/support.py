@@ -6,13 +6,16 @@ import numpy as np
 
 from docking.config.budget import docked_pose
 from docking.config.build import load_from, positioners_from, positioners_of, rank_settings
-from docking.config.cell import CellFile
+from docking.config.cell import CanBus, CellFile
 from docking.config.findings import Finding, error
 from docking.config.job import JobFile
 from docking.geometry import pose_from_vector
 from docking.kinematics import axis_displacements, axis_positions, conditioning, reaction_extremes, sink_mm
 from docking.kinematics.forces import ball_reactions_n
 from docking.types import Array, Pose
+
+FOLLOWER_LEAN_DEG = 5.0
+"""Most that an axis which holds a force may lean: its side force is carried by the axes of the other positioners."""
 
 
 def rank_findings(cell: CellFile) -> list[Finding]:
@@ -24,7 +27,7 @@ def rank_findings(cell: CellFile) -> list[Finding]:
         )
         for i, p in enumerate(cell.positioners)
         for j, axis in enumerate(p.axes)
-        if axis.name == "Z" and not axis.driven
+        if axis.name == "Z" and not axis.powered
     ]
     settings = rank_settings(cell)
     found = conditioning(positioners_of(cell), settings)
@@ -44,6 +47,29 @@ def rank_findings(cell: CellFile) -> list[Finding]:
             f"limits.condition_max = {settings.condition_max:g}"
         )
     return [*findings, error("positioners", text)]
+
+
+def follower_findings(cell: CellFile) -> list[Finding]:
+    """A force-controlled axis pushes against gravity, is weighed, within its rating, and on a bus that knows forces."""
+    findings = []
+    up = -np.array(cell.gravity_direction) / np.linalg.norm(cell.gravity_direction)
+    for i, p in enumerate(cell.positioners):
+        for j, axis in enumerate(p.axes):
+            if axis.force_n is None:
+                continue
+            upright = up @ axis.direction / np.linalg.norm(axis.direction)
+            lean = float(np.degrees(np.arccos(np.clip(upright, -1.0, 1.0))))
+            peak, rated = axis.force_n * (1.0 + axis.force_tolerance), p.rated_n["XYZ".index(axis.name)]
+            refusals = (
+                (not lean <= FOLLOWER_LEAN_DEG, f"its direction leans {lean:.3g} deg from straight up, at most "
+                 f"{FOLLOWER_LEAN_DEG:g} deg is allowed: only a vertical axis may hold a force"),
+                (not peak <= rated, f"up to {peak:.0f} N with its tolerance, its rated_n is {rated:.0f} N"),
+                (not (p.load_cell and cell.load_cells), "needs the load cell under its ball: load_cell and load_cells"),
+                (not isinstance(cell.bus, CanBus), f"a {cell.bus.kind} bus has no force-controlled axes"),
+            )  # fmt: skip
+            key = f"positioners[{i}].axes[{j}].force_n"
+            findings += [error(key, f"{p.name}.{axis.name}: {text}") for refused, text in refusals if refused]
+    return findings
 
 
 def reaction_findings(cell: CellFile, job: JobFile) -> list[Finding]:

@@ -1,7 +1,7 @@
 """Forces at the balls: reactions under gravity, internal force, warp. Domain 4, equation (11).
 
-A driven axis is a spring along itself; a passive axis carries nothing. Forces are what the sockets exert on
-the component.
+A driven axis is a spring along itself; a passive axis carries nothing; a force-controlled follower exerts the force it
+holds, wherever the component takes it. Forces are what the sockets exert on the component.
 """
 
 from __future__ import annotations
@@ -37,6 +37,12 @@ class Load:
         return result
 
     @property
+    def lightest_n(self) -> Array:
+        """Weight vector in W (3,) with the mass at the lower end of its tolerance."""
+        result: Array = (self.mass_kg - self.mass_tolerance_kg) * self.gravity_m_s2
+        return result
+
+    @property
     def up(self) -> Array:
         """Unit vector against gravity in W (3,)."""
         result: Array = -self.gravity_m_s2 / np.linalg.norm(self.gravity_m_s2)
@@ -50,7 +56,7 @@ class Load:
 
 
 def axis_stiffness_n_per_mm(positioners: Positioners) -> Array:
-    """Stiffness along each axis (m,): zero for a passive axis."""
+    """Stiffness along each axis (m,): zero for a passive axis and for one that holds a force."""
     result: Array = np.where(positioners.driven, positioners.stiffness_n_per_mm.reshape(-1), 0.0)
     return result
 
@@ -65,12 +71,17 @@ def _axis_to_ball(positioners: Positioners) -> Array:
 
 
 def ball_reactions_n(
-    positioners: Positioners, balls_W_mm: ArrayLike, coms_W_mm: ArrayLike, weight_n: ArrayLike
+    positioners: Positioners,
+    balls_W_mm: ArrayLike,
+    coms_W_mm: ArrayLike,
+    weight_n: ArrayLike,
+    held_n: Array | None = None,
 ) -> Array:
     """Reactions (c, k, 3) in W of the elastic support to `weight_n` (3,) acting at each of `coms_W_mm` (c, 3).
 
-    Solves (J^T K J) x = w_g for the small displacement x, then f = -K J x. Raises BallReactionOut when the driven
-    axes do not hold the component.
+    Solves (J^T K J) x = w_g + J^T h for the small displacement x, then f = h - K J x, where h = `held_n` (m,) is what
+    the force-controlled axes exert (their set force by default). Raises BallReactionOut when the driven axes do not
+    hold the component.
     """
     balls, coms = np.asarray(balls_W_mm, dtype=np.float64), np.atleast_2d(np.asarray(coms_W_mm, dtype=np.float64))
     weight = np.asarray(weight_n, dtype=np.float64)
@@ -84,8 +95,9 @@ def ball_reactions_n(
     if not condition < _CONDITION:
         cause = "Condition of the support: the driven axes do not hold the component in six degrees of freedom."
         raise BallReactionOut("driven axes", cause, value=condition, limit=_CONDITION)
+    held = (positioners.held_n if held_n is None else held_n)[:, None]
     wrench = np.hstack([np.broadcast_to(weight, coms.shape), np.cross(coms - centre, weight)]) * scale
-    axis_forces = -spring @ np.linalg.solve(normal, wrench.T)
+    axis_forces = held - spring @ np.linalg.solve(normal, wrench.T + jac.T @ held)
     result: Array = (_axis_to_ball(positioners) @ axis_forces).T.reshape(len(coms), -1, 3)
     return result
 
@@ -98,8 +110,11 @@ def axis_forces_n(positioners: Positioners, forces_W_n: ArrayLike) -> Array:
 
 
 def sink_mm(positioners: Positioners, reactions_n: ArrayLike) -> Array:
-    """How far the balls are displaced in W (k, 3) by the compliance of the driven axes under `reactions_n` (k, 3)."""
-    stiffness = axis_stiffness_n_per_mm(positioners)
+    """How far the balls are displaced in W (k, 3) by the compliance behind the motors under `reactions_n` (k, 3).
+
+    A passive axis gives no force to sink under; one that holds a force sinks like a driven one.
+    """
+    stiffness = np.where(positioners.powered, positioners.stiffness_n_per_mm.reshape(-1), 0.0)
     compliance = np.divide(1.0, stiffness, out=np.zeros_like(stiffness), where=stiffness > 0.0)
     give = -(axis_forces_n(positioners, reactions_n) * compliance).reshape(-1, 3)
     result: Array = np.einsum("kij,kj->ki", positioners.axes_W, give)
@@ -155,8 +170,8 @@ def warp_rows(balls_W_mm: ArrayLike, up: ArrayLike) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Reactions:
-    """Extremes over the corners of the centre of mass: least upward force as a fraction of the equal share (k,), the
-    least upward force in N (k,) and the largest |force| along each axis in N (m,)."""
+    """Extremes over the corners of the centre of mass and of the held forces: least upward force as a fraction of the
+    equal share (k,), the least upward force in N (k,) and the largest |force| along each axis in N (m,)."""
 
     least_share: Array
     least_up_n: Array
@@ -164,10 +179,20 @@ class Reactions:
 
 
 def reaction_extremes(positioners: Positioners, X_WC: Pose, load: Load) -> Reactions:
-    """Ball reactions with the component at X_WC, over the centre of mass and the corners of its tolerance."""
-    forces = ball_reactions_n(
-        positioners, X_WC.apply(positioners.balls_C_mm), X_WC.apply(load.com_corners_C_mm()), load.heaviest_n
-    )
+    """Ball reactions with the component at X_WC, over the centre of mass and the corners of its tolerance.
+
+    Where axes hold a force, also over the tolerances of these forces and with the least mass: what they do not take
+    comes from the others.
+    """
+    balls, coms = X_WC.apply(positioners.balls_C_mm), X_WC.apply(load.com_corners_C_mm())
+    followers = np.flatnonzero(positioners.followers)
+    weights = [load.heaviest_n, load.lightest_n] if len(followers) else [load.heaviest_n]
+    cases = []
+    for weight, signs in itertools.product(weights, itertools.product((-1.0, 1.0), repeat=len(followers))):
+        held = positioners.held_n.copy()
+        held[followers] += np.array(signs) * positioners.held_tolerance_n[followers]
+        cases.append(ball_reactions_n(positioners, balls, coms, weight, held))
+    forces = np.concatenate(cases)
     upward = forces @ load.up
     share = np.linalg.norm(load.heaviest_n) / len(positioners.names)
     least = upward.min(axis=0)

@@ -16,7 +16,7 @@ from docking.types import Array, readonly
 _LENGTHS = {
     "stroke_mm": "m2", "v_mm_s": "m", "a_mm_s2": "m", "j_mm_s3": "m", "a_quick_mm_s2": "m", "origins_W_mm": "k3",
     "axes_W": "k33", "stiffness_n_per_mm": "k3", "rated_n": "k3", "swivel_rad": "k", "balls_C_mm": "k3",
-    "neutral_R_WC": "33",
+    "neutral_R_WC": "33", "held_n": "m", "held_tolerance_n": "m",
 }  # fmt: skip
 
 
@@ -25,9 +25,11 @@ class Positioners:
     """k positioners, m = 3 k axes, in the order of the cell file.
 
     `origins_W_mm` (k, 3) socket centres with all axes at zero, unloaded; `axes_W` (k, 3, 3) columns = axis directions
-    times scale; `driven` (m,); `stroke_mm` (m, 2); `stiffness_n_per_mm`, `rated_n` (k, 3) along the axes;
-    `swivel_rad` (k,) most a ball may turn in its socket away from `neutral_R_WC`, the orientation of the component in
-    which the brackets are built to sit; `balls_C_mm` (k, 3) ball centres in the component frame.
+    times scale; `driven` (m,) axes that hold a position; `stroke_mm` (m, 2); `stiffness_n_per_mm`, `rated_n` (k, 3)
+    along the axes; `swivel_rad` (k,) most a ball may turn in its socket away from `neutral_R_WC`, the orientation of
+    the component in which the brackets are built to sit; `balls_C_mm` (k, 3) ball centres in the component frame;
+    `held_n` (m,) force on the component along itself that a force-controlled axis holds, with `held_tolerance_n` (m,),
+    both 0 for all others.
     """
 
     names: tuple[str, ...]
@@ -45,10 +47,15 @@ class Positioners:
     swivel_rad: Array
     balls_C_mm: Array
     neutral_R_WC: Array
+    held_n: Array = field(default_factory=lambda: np.zeros(0))
+    held_tolerance_n: Array = field(default_factory=lambda: np.zeros(0))
     axes_inverse: Array = field(init=False)
 
     def __post_init__(self) -> None:
         sizes = {"k": len(self.names), "m": 3 * len(self.names), "2": 2, "3": 3}
+        for name in ("held_n", "held_tolerance_n"):
+            if getattr(self, name).size == 0:
+                object.__setattr__(self, name, np.zeros(sizes["m"]))
         for name, letters in _LENGTHS.items():
             value = readonly(getattr(self, name))
             if value.shape != tuple(sizes[letter] for letter in letters):
@@ -57,9 +64,22 @@ class Positioners:
         driven = np.array(self.driven, dtype=np.bool_)
         if driven.shape != (sizes["m"],) or len(self.axes) != sizes["m"]:
             raise ValueError(f"driven and axes need {sizes['m']} entries")
+        if np.any(driven & (self.held_n != 0.0)):
+            raise ValueError("an axis holds a position or a force, not both")
         driven.setflags(write=False)
         object.__setattr__(self, "driven", driven)
         object.__setattr__(self, "axes_inverse", readonly(np.linalg.inv(self.axes_W)))
+
+    @property
+    def followers(self) -> NDArray[np.bool_]:
+        """Axes (m,) that hold a force."""
+        result: NDArray[np.bool_] = self.held_n != 0.0
+        return result
+
+    @property
+    def powered(self) -> NDArray[np.bool_]:
+        """Axes (m,) under power: those that hold a position and those that hold a force."""
+        return self.driven | self.followers
 
 
 def socket_positions(positioners: Positioners, q_mm: ArrayLike) -> Array:
