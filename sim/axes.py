@@ -64,6 +64,7 @@ class AxisBank:
         self._first_stick = truth.stick_mm[0].copy()
         self.still = True
         self.jammed: BoolArray = np.zeros(count, dtype=bool)
+        self._dragged_mm_s: Array = np.zeros(count)
         self._active: BoolArray = np.zeros(count, dtype=bool)
         self._idle: BoolArray = np.ones(count, dtype=bool)
         self._falling: BoolArray = np.zeros(count, dtype=bool)
@@ -107,11 +108,18 @@ class AxisBank:
             return False
         return self._struggle(dt_s, target_mm)
 
-    def seize(self, index: int, jammed: bool) -> None:
-        """Jam or free one axis mechanically."""
+    def seize(self, index: int, jammed: bool, dragged_mm_s: float = 0.0) -> None:
+        """Jam or free one axis mechanically; a jammed axis is `dragged_mm_s` along whatever servo and brake want."""
         self.jammed[index] = jammed
+        self._dragged_mm_s[index] = dragged_mm_s
         self._flags = (b"", b"")
         self.still = False
+
+    def weaken(self, index: int, v_mm_s: float, a_mm_s2: float) -> None:
+        """Let one axis reach no more than this speed and acceleration."""
+        truth = self.truth
+        truth.v_max[index], truth.a_max[index] = v_mm_s, a_mm_s2
+        self._v_floor, self._a_floor = float(truth.v_max.min()), float(truth.a_max.min())
 
     def _regroup(self, powered: BoolArray, braked: BoolArray) -> None:
         driven = self.truth.driven
@@ -188,7 +196,7 @@ class AxisBank:
         for k in np.flatnonzero(self.truth.driven).tolist():
             rate = float(self._last_delta[k]) / dt_s
             if self.jammed[k]:
-                rate = 0.0
+                rate = float(self._dragged_mm_s[k])
                 if not self._idle[k]:
                     self._set[k] = target_mm[k]
             elif self._active[k]:

@@ -12,7 +12,7 @@ _HOUR_S = 3600.0
 
 
 class LoadCells:
-    """Turns true axis forces into readings; axes without a cell read NaN."""
+    """Turns true axis forces into readings; axes without a cell read NaN. `offset_n` (m,) is what a fault adds."""
 
     def __init__(self, cell: CellFile, truth: TruthFile, draws: Draws) -> None:
         count = len(cell.positioners)
@@ -26,6 +26,7 @@ class LoadCells:
         self._drift_n_s = (
             truth.load_cell_drift.fraction * draws.uniform("load_cell_drift", (3 * count,)) * self._range_n / _HOUR_S
         )
+        self.offset_n: Array = np.zeros(3 * count)
         self._noise_n = truth.load_cell_noise.fraction * self._range_n
         self._draws = draws
 
@@ -33,5 +34,5 @@ class LoadCells:
         """(m,) readings for the true axis forces (m,)."""
         mixed = np.einsum("kij,kj->ki", self._gain, force_n.reshape(-1, 3)).ravel()
         noise = self._noise_n * self._draws.normal("load_cell_noise", (len(force_n),))
-        reading: Array = mixed + self._drift_n_s * elapsed_s + noise + self._mask
+        reading: Array = mixed + self._drift_n_s * elapsed_s + noise + self._mask + self.offset_n
         return reading

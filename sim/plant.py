@@ -178,10 +178,28 @@ class Plant:
         self._seize(axis, True)
 
     def release(self, axis: str) -> None:
-        """Free a jammed axis."""
+        """Free a jammed or creeping axis."""
         self._seize(axis, False)
 
+    def creep(self, axis: str, speed_mm_s: float) -> None:
+        """Let a driven axis move whatever its servo and brake want: drift, slipping brake, runaway."""
+        self._bank.seize(self._driven(axis), True, speed_mm_s)
+
+    def weaken(self, axis: str, v_mm_s: float, a_mm_s2: float) -> None:
+        """Let a driven axis reach no more than this speed and acceleration."""
+        self._bank.weaken(self._driven(axis), v_mm_s, a_mm_s2)
+
+    def misread_force(self, axis: str, offset_n: float) -> None:
+        """Add this to what the load cell reads along `axis`; NaN and infinity break it. The true force stays."""
+        self._load_cells.offset_n[self.axes.index(axis)] = offset_n
+
     # What follows works out the component's equilibrium, only when somebody asks.
+
+    def _driven(self, axis: str) -> int:
+        index = self.axes.index(axis)
+        if self._passive[index]:
+            raise ValueError(f"{axis} is passive: it has no servo and no brake")
+        return index
 
     def _seize(self, axis: str, jammed: bool) -> None:
         index = self.axes.index(axis)

@@ -14,8 +14,17 @@ from sim.canopen.plant_axes import NEWTON_PER_COUNT, PlantAxes
 class ObjectAccess:
     """Objects in the drives' units (counts, counts/s^2, 10 N) against millimetres and newtons."""
 
-    def __init__(self, drives: Drives, plant: PlantAxes, counts_per_mm: float, now_s: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        drives: Drives,
+        plant: PlantAxes,
+        counts_per_mm: float,
+        now_s: Callable[[], float],
+        shown_mm: Callable[[Array], Array],
+    ) -> None:
+        """`shown_mm` makes reported positions (m,) of the encoders' ones."""
         self._drives, self._plant, self._counts_per_mm, self._now_s = drives, plant, counts_per_mm, now_s
+        self._shown_mm = shown_mm
         limits = drives.parameters
         self._lengths: dict[tuple[int, int], Array] = {
             (0x6065, 0): limits.window_mm,
@@ -37,7 +46,7 @@ class ObjectAccess:
         if obj == 0x6061:
             return drives.modes[index]
         if obj == 0x6064:
-            return round(float(self._plant.encoder_mm()[index]) * self._counts_per_mm)
+            return round(float(self._shown_mm(self._plant.encoder_mm())[index]) * self._counts_per_mm)
         if obj == 0x60F4:
             return round(float(self._plant.following_error_mm()[index]) * self._counts_per_mm)
         if obj == 0x603F:

@@ -70,7 +70,8 @@ class Entry:
 
 class Dictionary:
     """Objects of one node. `live(index, sub)` answers for values that change by themselves, None for the rest;
-    `changed(index, sub, value)` hears of every write after it was stored; `operational()` guards the PDO set-up."""
+    `changed(index, sub, value)` hears of every write after it was stored; `operational()` guards the PDO set-up.
+    Faults: writes to `refused` objects are aborted with their code, writes to `deaf` ones change nothing."""
 
     def __init__(
         self,
@@ -81,6 +82,8 @@ class Dictionary:
         operational: Callable[[], bool],
     ) -> None:
         self.node = node
+        self.refused: dict[tuple[int, int], int] = {}
+        self.deaf: set[tuple[int, int]] = set()
         self._live, self._changed, self._operational = live, changed, operational
         self._entries: dict[tuple[int, int], Entry] = {**_identity(node, settings), **_drive(), **_pdos(node)}
 
@@ -106,6 +109,8 @@ class Dictionary:
         entry = self._find(index, sub)
         if not entry.writable:
             raise Abort(READ_ONLY)
+        if (index, sub) in self.refused:
+            raise Abort(self.refused[index, sub])
         size = struct.calcsize("<" + entry.kind)
         if len(data) != size:
             raise Abort(TOO_LONG if len(data) > size else TOO_SHORT)
@@ -115,6 +120,8 @@ class Dictionary:
             raise Abort(OUT_OF_RANGE)
         if 0x1400 <= index < 0x1C00:
             self._check_pdo(index, sub, value)
+        if (index, sub) in self.deaf:
+            return
         self._entries[index, sub] = replace(entry, value=value)
         self._changed(index, sub, value)
 

@@ -81,6 +81,8 @@ class Drives:
         self._now: Array = start_mm.copy()
         self._speed: Array = np.zeros(count)
         self._limited: BoolArray = np.zeros(count, np.bool_)
+        self._switched: BoolArray = np.zeros(count, np.bool_)
+        self._seized_brakes: dict[int, bool] = {}
         self._brake_due: dict[int, tuple[float, bool]] = {}
         self._over_since: dict[int, float] = {}
         self._moving_limit = False
@@ -184,6 +186,18 @@ class Drives:
         if self.stages[index] not in (Stage.FAULT, Stage.FAULT_REACTION):
             self._enter(index, Stage.SWITCH_ON_DISABLED, t_s)
 
+    def limit_switch(self, index: int, on: bool) -> None:
+        """A limit switch of one axis opens or closes; bit 11 tells of it."""
+        self._switched[index] = on
+        self._report(index)
+
+    def seize_brake(self, index: int, closed: bool | None) -> None:
+        """From its next order on a brake ends up closed or open whatever it is told; None heals it."""
+        if closed is None:
+            self._seized_brakes.pop(index, None)
+        else:
+            self._seized_brakes[index] = closed
+
     def _begin_ramp(self, index: int, stage: Stage, t_s: float) -> None:
         if self.stages[index] is Stage.OPERATION:
             speed = (self._goal[index] - self._start[index]) / self.cycle_s
@@ -223,7 +237,7 @@ class Drives:
         for index, (due, close) in list(self._brake_due.items()):
             if t_s >= due - 1e-9:
                 del self._brake_due[index]
-                self.braked[index] = close
+                self.braked[index] = self._seized_brakes.get(index, close)
                 self._report(index)
         for index, stage in enumerate(self.stages):
             if stage in _RAMPING:
@@ -281,7 +295,7 @@ class Drives:
         """Compose the statusword."""
         word = int(self.stages[index]) | _REMOTE_AND_VOLTAGE
         word |= _FOLLOWS if self.following[index] else 0
-        word |= _LIMIT if self._limited[index] else 0
+        word |= _LIMIT if self._limited[index] or self._switched[index] else 0
         word |= _BRAKE if self.braked[index] else 0
         word |= _WINDOW if self.error_codes[index] == FOLLOWING_ERROR else 0
         self.statuswords[index] = word

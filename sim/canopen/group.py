@@ -15,6 +15,8 @@ from docking.types import Array
 from sim.canopen.access import ObjectAccess
 from sim.canopen.dictionary import INVALID
 from sim.canopen.drives import HOST_LOST, SYNC_LOST, Drives, Stage
+from sim.canopen.faults import DriveFaults
+from sim.canopen.faulty_wire import FaultyWire
 from sim.canopen.heartbeats import Heartbeats
 from sim.canopen.node import PRE_OPERATIONAL, Node
 from sim.canopen.plant_axes import NEWTON_PER_COUNT, PlantAxes
@@ -40,14 +42,16 @@ class DriveGroup:
     ) -> None:
         if not isinstance(cell.bus, CanBus):
             raise ConfigInvalid(cell.name, (f"bus.kind is {cell.bus.kind!r}: no CAN drives to simulate",))
-        self._plant, self._link, self._loop, self._settings = plant, link, loop, settings
+        self._plant, self._loop, self._settings = plant, loop, settings
+        self._link = FaultyWire(link, loop)
         self._counts_per_mm = cell.bus.counts_per_mm
         self._axes = cell.axis_names
-        self.drives = Drives(plant.encoder_mm(), cell.bus.cycle_s, settings, self._emergency)
+        self.faults = DriveFaults(self, self._link, self._axes, self._counts_per_mm)
+        self.drives = Drives(plant.encoder_mm(), cell.bus.cycle_s, settings, self.emergency)
         numbers = [axis.node or 0 for p in cell.positioners for axis in p.axes]
         self.nodes = [Node(i, number, settings, self) for i, number in enumerate(numbers)]
-        self._handlers = {cob: (node, kind) for node in self.nodes for cob, kind in node.listens()}
-        self._access = ObjectAccess(self.drives, plant, self._counts_per_mm, loop.time)
+        self._handlers: dict[int, tuple[Node, str]] = {}
+        self._access = ObjectAccess(self.drives, plant, self._counts_per_mm, loop.time, self.faults.shown_mm)
         self._heartbeats = Heartbeats(self.nodes, loop, self._transmit, self._host_lost, self._host_returned)
         self.muted: set[int] = set()
         self._sync_s: float | None = None
@@ -69,12 +73,13 @@ class DriveGroup:
         self._last_joined = self._batch_joined = b""
         self._last_words = self._last_modes = b""
         self._relatch = False
-        self.remap()
+        self.renumber()
 
     # life --------------------------------------------------------------------------------------------------------
     def start(self) -> None:
         """Power up: every node sends its boot-up message and is pre-operational."""
         self._link.on_frames = self._on_frames
+        self._link.open()
         self._transmit([node.boot_up() for node in self.nodes])
 
     def close(self) -> None:
@@ -99,6 +104,19 @@ class DriveGroup:
     def restart(self, axis: str) -> None:
         """Let one node reset by itself: torque off, boot-up, pre-operational, factory settings."""
         self.reset_node(self.nodes[self._axes.index(axis)])
+
+    def now_s(self) -> float:
+        """The drives' own clock."""
+        return self._loop.time()
+
+    def renumber(self) -> None:
+        """Take the nodes' numbers over: who hears which identifier."""
+        self._handlers = {cob: (node, kind) for node in self.nodes for cob, kind in node.listens()}
+        self.remap()
+
+    def forget_read_backs(self) -> None:
+        """What the drives report has changed although nothing has moved."""
+        self._cached = self._table_encoder = None
 
     # frames ------------------------------------------------------------------------------------------------------
     def _on_frames(self, batch: list[CanFrame]) -> None:
@@ -232,7 +250,7 @@ class DriveGroup:
         plant, table = self._plant, self._table
         encoder = plant.encoder_mm()
         if encoder is not self._table_encoder:
-            table["position"] = np.rint(encoder * self._counts_per_mm)
+            table["position"] = np.rint(self.faults.shown_mm(encoder) * self._counts_per_mm)
             self._table_encoder = encoder
         # The low 16 bits of the 32-bit following error: larger errors wrap, as on a real drive.
         table["error"] = np.rint(self._error * self._counts_per_mm).astype(np.int64)
@@ -243,6 +261,8 @@ class DriveGroup:
 
     def _forces(self) -> list[CanFrame]:
         counts = np.rint(self._plant.force_n()[self._force_index] / NEWTON_PER_COUNT)
+        # A broken load cell shows the most negative number.
+        counts[np.isnan(counts)] = -32768.0
         raw = np.maximum(np.minimum(counts, 32767.0), -32768.0).astype("<i2").tobytes()
         return [(cob, raw[2 * i : 2 * i + 2]) for i, cob in enumerate(self._force_cobs)]
 
@@ -304,7 +324,7 @@ class DriveGroup:
             if self._settings.sync_loss == "fault":
                 self.drives.trip(index, SYNC_LOST, now_s)
             elif self._settings.sync_loss == "quick-stop":
-                self._emergency(index, SYNC_LOST)
+                self.emergency(index, SYNC_LOST)
                 self.drives.quick_stop(index, now_s)
 
     def _coast(self, now_s: float) -> None:
@@ -324,7 +344,7 @@ class DriveGroup:
     def _host_lost(self, node: Node) -> None:
         """React as 6007h and 1029h say."""
         now_s = self._loop.time()
-        self._emergency(node.index, HOST_LOST)
+        self.emergency(node.index, HOST_LOST)
         option = node.number_of(0x6007)
         if option == 1:
             self.drives.trip(node.index, HOST_LOST, now_s)
@@ -337,9 +357,10 @@ class DriveGroup:
             self.remap()
 
     def _host_returned(self, node: Node) -> None:
-        self._emergency(node.index, 0)
+        self.emergency(node.index, 0)
 
-    def _emergency(self, index: int, code: int) -> None:
+    def emergency(self, index: int, code: int) -> None:
+        """Send an emergency message of one node; code 0 tells that its errors are gone."""
         node = self.nodes[index]
         if not node.number_of(0x1014) & INVALID:
             register = 0 if code == 0 else 0x11 if code >> 12 == 8 else 0x01

@@ -41,6 +41,12 @@ class VirtualCanEnd:
     def close(self) -> None:
         self.is_open = False
 
+    def drop(self, reason: str) -> None:
+        """This station alone falls off the bus, as one whose frames are refused (queue full) or that is bus-off."""
+        if self.is_open:
+            self.is_open = False
+            self.on_lost(reason)
+
 
 class VirtualCan:
     """The bus. `keep(cob, data)` may be set to lose single frames on their way (False = lost)."""
