@@ -342,6 +342,18 @@ class PlanInputInvalid(PlanError):
     code = 5010
 
 
+class StrainForeseen(PlanError):
+    code = 5012
+
+
+class MateTooNear(PlanError):
+    code = 5013
+
+
+class ApproachRefused(PlanError):
+    code = 5014
+
+
 # 6xxx what may happen when ---------------------------------------------------------------------------------------
 class StateError(DockingError):
     """What may happen when."""

@@ -208,13 +208,41 @@ class Correction(_Frozen):
 
 
 @dataclass(frozen=True, eq=False)
+class PlanBounds(_Frozen):
+    """What the pre-flight foresees of a plan; (m,) in the order of its axes.
+
+    `peak_mm_s` (m,); `quick_stop_s` in which all axes ramp down together with a_quick. If an axis jams at its peak
+    speed the worst ball parts by `jam_mm` (m,) and feels `jam_n` (m,); if it ramps down by itself, by `ramp_mm` (m,).
+    `residual_mm`, `force_n`, `warp_n`: largest at any instant from the devices' straight interpolation between two rows
+    and from their start and clock differences. `clearance_mm` from the mate where it least exceeds what is asked, at
+    path coordinate `clearance_s`, asked there `clearance_asked_mm`, all NaN where nothing is declared. `limits`: each
+    limit with the share of it that the plan uses, largest first: the first one sets the speed.
+    """
+
+    peak_mm_s: Array
+    quick_stop_s: float
+    jam_mm: Array
+    jam_n: Array
+    ramp_mm: Array
+    residual_mm: float
+    force_n: float
+    warp_n: float
+    clearance_mm: float
+    clearance_asked_mm: float
+    clearance_s: float
+    duration_s: float
+    limits: tuple[tuple[str, float], ...]
+
+
+@dataclass(frozen=True, eq=False)
 class Plan(_Frozen):
     """A checked move as a table: what the positioners do when the path is run at full rate.
 
     `t_s` (n,) path time on an even grid of `period_s`; `q_mm` (n, m) axis positions in the order of `axes`
     (driven and passive); `s` (n,) the scalar path coordinate 0..1. `plan_hash` identifies the content.
     `margins`: for each axis the least room to the stroke's margin (mm) and to its speed limit (mm/s).
-    `duration_s` is t_s[-1]. All stops and holds change the rate at which path time runs, never the path.
+    `bounds` is what the pre-flight foresees, None only of a table that was not planned. `duration_s` is t_s[-1]. All
+    stops and holds change the rate at which path time runs, never the path.
     """
 
     plan_id: int
@@ -231,6 +259,7 @@ class Plan(_Frozen):
     rate_slew_per_s: float
     speed_limited_by: str
     margins: tuple[tuple[str, float, float], ...] = ()
+    bounds: PlanBounds | None = None
 
     @property
     def duration_s(self) -> float:
