@@ -163,6 +163,10 @@ class LeaseLost(MotionError):
     code = 2116
 
 
+class StopOverdue(MotionError):
+    code = 2117
+
+
 class AxisStuck(MotionError):
     code = 2121
 

@@ -1,0 +1,147 @@
+"""The fault arbiter: triggers in, the reaction in force out. Pure: time comes in, nothing is waited for or sent.
+
+`python -m docking.motion.arbiter` prints the table of reactions for the documents.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from enum import Enum
+
+from docking.errors import EventRefused, StopOverdue
+from docking.motion.reactions import REACTIONS, REQUESTS, Mode, Reaction, document
+from docking.motion.triggers import Finding, Trigger
+
+__all__ = ["REACTIONS", "Arbiter", "Mode", "Reaction", "Role"]
+
+RELEASE_S = 0.5
+"""Presses of reset that follow each other faster are one press, held."""
+
+
+class Role(Enum):
+    """Who asks for a reset."""
+
+    VIEWER = "viewer"
+    OPERATOR = "operator"
+    SUPERVISOR = "supervisor"
+    ENGINEER = "engineer"
+
+
+OPERATORS_OWN = frozenset({Trigger.LEASE_LOST, Trigger.PERMISSIVE_LOST, Trigger.PROTECTIVE_STOP, Trigger.TICK_LATE})
+"""Causes outside drives and part: an operator may reset them, all others need a supervisor."""
+
+FINAL = frozenset({Trigger.DEFECT})
+"""Causes after which this program is not to be trusted with axes until it has been started again."""
+
+
+class Arbiter:
+    """Decides by `REACTIONS` and keeps what it decided.
+
+    `allowed_s(reaction)` is asked when a reaction begins: how long until standstill (PPS, FAST_PPS, SQS) or until the
+    brakes hold (SBT); after that the next reaction begins. The motion side tells `mode` what it does by `enter`.
+    """
+
+    def __init__(self, allowed_s: Callable[[Reaction], float]) -> None:
+        self.mode = Mode.OFF
+        self.reaction = Reaction.NONE
+        self.first: Finding | None = None
+        self.later: tuple[Finding, ...] = ()
+        self.rejected = 0
+        self._allowed_s = allowed_s
+        self._begun_s = self._limit_s = 0.0
+        self._raised = False
+        self._gone = True
+        self._pressed_s = float("-inf")
+
+    @property
+    def latched(self) -> bool:
+        """True while a fault is kept: nothing may start."""
+        return self.first is not None
+
+    def enter(self, mode: Mode) -> None:
+        """The motion side is now OFF, STANDING or MOVING. STOPPING is entered and left by reactions alone.
+
+        Raises EventRefused where a fault is kept and a move is to begin, or a reaction is under way.
+        """
+        if mode is Mode.STOPPING or (mode is Mode.MOVING and (self.latched or self.mode is not Mode.STANDING)):
+            raise EventRefused("motion", f"the axes are {self.mode.value}", value=f"to be {mode.value}")
+        if self.mode is not Mode.STOPPING:
+            self.mode = mode
+
+    def raise_(self, finding: Finding, now_s: float) -> Reaction:
+        """Take a finding; return the reaction in force, which never gets milder before a reset."""
+        asked = REACTIONS[finding.trigger, self.mode]
+        if asked <= Reaction.REJ:
+            self.rejected += 1
+            return self.reaction
+        if finding.trigger not in REQUESTS:
+            self._raised, self._gone = True, False
+            self._note(finding)
+        if asked > self.reaction:
+            self._begin(asked, now_s)
+        return self.reaction
+
+    def poll(self, now_s: float, standing: bool) -> Reaction:
+        """Once a cycle, after its findings: escalate what is overdue; return the reaction in force.
+
+        `standing`: the reaction has reached its end (axes at rest; for SBT brakes confirmed and torque off).
+        """
+        if self.mode is Mode.STOPPING and self.reaction is not Reaction.HW:
+            if standing:
+                self._end()
+            elif not (now_s - self._begun_s <= self._limit_s):
+                self.raise_(self._overdue(now_s), now_s)
+        self._gone, self._raised = not self._raised, False
+        return self.reaction
+
+    def reset(self, role: Role, now_s: float) -> None:
+        """Forget the fault. Moves nothing and resumes nothing. Raises EventRefused with the reason."""
+        held = now_s - self._pressed_s < RELEASE_S
+        self._pressed_s = now_s
+        reason = self._why_not(role, held)
+        if reason:
+            raise EventRefused("reset", reason, value=f"reset by {role.value}")
+        self.reaction, self.first, self.later = Reaction.NONE, None, ()
+
+    def _why_not(self, role: Role, held: bool) -> str:
+        causes = {finding.trigger for finding in (self.first, *self.later) if finding is not None}
+        enough = role is Role.SUPERVISOR or (role is Role.OPERATOR and causes <= OPERATORS_OWN)
+        reasons = (
+            (not self.latched, "There is nothing to reset."),
+            (self.reaction is Reaction.HW, "The hardware chain was opened: start the controller again."),
+            (bool(causes & FINAL), "The program has an error: start the controller again."),
+            (not enough, "This takes a supervisor."),
+            (self.mode in (Mode.MOVING, Mode.STOPPING), "The axes are not at rest."),
+            (not self._gone, "The cause is still there."),
+            (held, "The key was held down: let it go, then press it again."),
+        )
+        return next((text for applies, text in reasons if applies), "")
+
+    def _note(self, finding: Finding) -> None:
+        """Keep the first finding of each trigger."""
+        if self.first is None:
+            self.first = finding
+        elif all(finding.trigger is not known.trigger for known in (self.first, *self.later)):
+            self.later = (*self.later, finding)
+
+    def _begin(self, reaction: Reaction, now_s: float) -> None:
+        self.reaction = reaction
+        if reaction >= Reaction.PPS:
+            self.mode = Mode.STOPPING
+            self._begun_s, self._limit_s = now_s, self._allowed_s(reaction)
+
+    def _end(self) -> None:
+        self.mode = Mode.OFF if self.reaction is Reaction.SBT else Mode.STANDING
+        if not self.latched:
+            self.reaction = Reaction.NONE
+
+    def _overdue(self, now_s: float) -> Finding:
+        taken_s, name = now_s - self._begun_s, self.reaction.name
+        led = self.reaction < Reaction.SQS
+        trigger = Trigger.STOP_OVERDUE if led else Trigger.QUICK_STOP_OVERDUE
+        return Finding(trigger, StopOverdue(name, value=taken_s, limit=self._limit_s))
+
+
+if __name__ == "__main__":
+    sys.stdout.write(document())
