@@ -28,7 +28,7 @@ class AxisTruth:
     `lag_s` servo time constant; `v_max`, `a_max` what the drive can do; `stroke_mm` (m, 2) hard stops;
     `backlash_mm` full width; `lead` relative lead error; `wander_mm` (m, w) amplitudes, `wave_per_mm` (m, w) and
     `phase` (m, w) of the repeatability; `stick_mm` (stops, m) offset after each stop; `down` (m,) sign of the axis
-    direction that gravity pulls to, 0 for level axes.
+    direction that gravity pulls to, 0 for level axes; `driven` (m,) axes with a servo.
     """
 
     lag_s: Array
@@ -67,6 +67,7 @@ class AxisBank:
         self._dragged_mm_s: Array = np.zeros(count)
         self._active: BoolArray = np.zeros(count, dtype=bool)
         self._idle: BoolArray = np.ones(count, dtype=bool)
+        self._led: BoolArray = truth.driven
         self._falling: BoolArray = np.zeros(count, dtype=bool)
         self._all_active = False
         self._flags = (b"", b"")
@@ -121,8 +122,19 @@ class AxisBank:
         truth.v_max[index], truth.a_max[index] = v_mm_s, a_mm_s2
         self._v_floor, self._a_floor = float(truth.v_max.min()), float(truth.a_max.min())
 
+    def let_go(self, floating: BoolArray) -> None:
+        """Servo axes that hold no position from now on (m,): their motors go where the load takes them."""
+        self._led = self.truth.driven & ~floating
+        self._ramp[~self._led] = 0.0
+        self._last_delta[floating] = 0.0
+        self._flags = (b"", b"")
+
+    def take_up(self, index: int, speed_mm_s: float) -> None:
+        """Begin to hold the position of an axis that is on its way."""
+        self._last_delta[index] = speed_mm_s * self._dt if self._dt > 0.0 else 0.0
+
     def _regroup(self, powered: BoolArray, braked: BoolArray) -> None:
-        driven = self.truth.driven
+        driven = self._led
         self._idle = ~(powered & driven)
         was_active = self._active
         self._active = powered & driven & ~braked & ~self.jammed
@@ -153,7 +165,7 @@ class AxisBank:
         if not abs(dt_s - self._dt) < 1e-9:
             self._prepare(dt_s)
         ramp, error, delta, size = self._ramp, self._error, self._delta, self._size
-        np.subtract(target_mm, self._set, out=ramp, where=self.truth.driven)
+        np.subtract(target_mm, self._set, out=ramp, where=self._led)
         np.subtract(self._set, self.motor_mm, out=error)
         error *= self._decay
         np.multiply(ramp, self._gain, out=delta)
@@ -193,7 +205,7 @@ class AxisBank:
     def _struggle(self, dt_s: float, target_mm: Array) -> bool:
         """The rare cycle: limits reached, axes off, braked, jammed or falling. Works axis by axis."""
         delta = np.zeros_like(self.motor_mm)
-        for k in np.flatnonzero(self.truth.driven).tolist():
+        for k in np.flatnonzero(self._led).tolist():
             rate = float(self._last_delta[k]) / dt_s
             if self.jammed[k]:
                 rate = float(self._dragged_mm_s[k])

@@ -3,7 +3,8 @@
 Each axis k of a positioner is a spring between socket and ball: gap `e_k = u_k - a_k.(p - o)` in axis coordinates
 (a_k row k of the inverse of the positioner's direction matrix), force on the component `f_k = k_k (e_k + s_k)` along
 itself, so the ball force is `sum_k f_k a_k` and the spring energy is consistent. The slip s_k is Coulomb play: it
-yields when |f_k| exceeds the friction of the axis, inside +-clearance (infinite for a passive axis that slides freely).
+yields when |f_k - h_k| exceeds the friction of the axis, inside +-clearance (infinite for a passive axis that slides
+freely). h_k is the force that a force-controlled axis holds, 0 for all others.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ class Supports:
     """The springs under the component: k balls, m = 3 k axes.
 
     `rows` (m, 3) the a_k; `origin_mm` (k, 3) sockets in W at zero; `stiffness` (m,) N/mm; `friction_n` (m,) and
-    `clearance_mm` (m,) half play of the slip (friction infinite = never slips); `driven` (m,) bool.
+    `clearance_mm` (m,) half play of the slip (friction infinite = never slips); `driven` (m,) bool: holds a position;
+    `held_n` (m,) set force of the axes that hold a force, 0 for all others.
     """
 
     rows: Array
@@ -42,6 +44,7 @@ class Supports:
     friction_n: Array
     clearance_mm: Array
     driven: BoolArray
+    held_n: Array
 
 
 @dataclass(frozen=True)
@@ -106,7 +109,9 @@ class Equilibrium:
         self.force_n: Array = np.zeros(count)
         self._blocks = supports.rows.reshape(-1, 3, 3)
         self._locked = np.zeros(count, dtype=bool)
+        self._friction_n: Array = supports.friction_n.copy()
         self._limit_mm: Array = supports.friction_n / supports.stiffness
+        self._held_mm: Array = np.zeros(count)
         self._driven_stiffness = np.where(supports.driven, supports.stiffness, 0.0)
         self._pattern = b""
         self._sliding = np.zeros(count, dtype=bool)
@@ -117,9 +122,18 @@ class Equilibrium:
     def lock(self, index: int, locked: bool) -> None:
         """Seize (or free) the slip of one axis."""
         self._locked[index] = locked
-        friction = np.where(self._locked, np.inf, self.supports.friction_n)
-        self._limit_mm = friction / self.supports.stiffness
+        self._limit_mm = np.where(self._locked, np.inf, self._friction_n) / self.supports.stiffness
         self._pattern = b""
+
+    def hold(self, held_n: Array) -> None:
+        """Let the axes that slide exert these forces (m,), give or take their friction."""
+        self._held_mm = held_n / self.supports.stiffness
+        self._pattern = b""
+
+    def part(self, index: int) -> None:
+        """One axis touches its ball no more: it exerts nothing, whatever it does."""
+        self._friction_n[index] = 0.0
+        self.lock(index, False)
 
     def jacobian(self, body: Body, balls_mm: Array) -> Array:
         """(m, 6): change of each ball's axis coordinate with the body's [shift, rotation]. Balls (k, 3) in C."""
@@ -141,11 +155,12 @@ class Equilibrium:
         return forces
 
     def stress_free_n(self, body: Body, balls_mm: Array, com_mm: Array, weight_n: Array) -> Array:
-        """(m,) the axis forces that equilibrium needs and no more: the stiffness-weighted least-norm reactions."""
-        jac = self.jacobian(body, balls_mm)
+        """(m,) the axis forces that equilibrium needs and no more: the stiffness-weighted least-norm reactions, beside
+        the set forces of the axes that hold one."""
+        jac, held = self.jacobian(body, balls_mm), self.supports.held_n
         scaled = self._driven_stiffness[:, None] * jac
-        wrench = self._wrench(body, com_mm[None, :], weight_n[None, :])
-        forces: Array = -scaled @ np.linalg.solve(jac.T @ scaled, wrench)
+        wrench = self._wrench(body, com_mm[None, :], weight_n[None, :]) + jac.T @ held
+        forces: Array = held - scaled @ np.linalg.solve(jac.T @ scaled, wrench)
         return forces
 
     def advance(self, socket_shift_mm: Array) -> None:
@@ -218,10 +233,11 @@ class Equilibrium:
     def _yielded(self, gap: Array) -> tuple[Array, Array, BoolArray]:
         """Slip (m,), force (m,) and whether each axis is sliding, for the gaps (m,)."""
         sup, limit = self.supports, self._limit_mm
-        slip = np.minimum(np.maximum(self.slip_mm, -limit - gap), limit - gap)
+        over = gap - self._held_mm
+        slip = np.minimum(np.maximum(self.slip_mm, -limit - over), limit - over)
         slip = np.minimum(np.maximum(slip, -sup.clearance_mm), sup.clearance_mm)
         stretch = gap + slip
-        sliding = (np.abs(stretch) >= limit * (1.0 - 1e-12)) & (np.abs(slip) < sup.clearance_mm)
+        sliding = (np.abs(over + slip) >= limit * (1.0 - 1e-12)) & (np.abs(slip) < sup.clearance_mm)
         return slip, sup.stiffness * stretch, sliding
 
     @staticmethod

@@ -19,6 +19,7 @@ from docking.errors import ConfigInvalid
 from docking.types import Array, Pose, readonly
 from sim.axes import AxisBank
 from sim.elastic import Body, Equilibrium
+from sim.followers import Followers
 from sim.load_cells import LoadCells
 from sim.shapes import ComponentShape, MateShape, docked_pose, pose_of
 from sim.supports import gravity_unit, true_axes, true_supports
@@ -53,6 +54,9 @@ class Plant:
         sockets, self._start_fore = self._seat(truth, draws)
         self._bank = AxisBank(axis_truth, sockets, self._carries)
         _check_strokes(self.axes, self._bank.motor_mm, axis_truth.stroke_mm)
+        self._followers = Followers(self._supports.held_n > 0.0, self._equilibrium, self._bank)
+        self._has_followers = bool(self._followers.mask.any())
+        self._high_mm: Array = axis_truth.stroke_mm[:, 1]
         self._load_cells = LoadCells(cell, truth, draws)
         self._place_ers(cell, job, draws)
         ppm = truth.clock_ppm.ppm * draws.uniform("clock_ppm", (len(cell.positioners),))
@@ -63,27 +67,45 @@ class Plant:
         self._epoch_s: float | None = None
         self._t_s = 0.0
         self._encoder: Array | None = None
-        self._moved = False
+        self._moved = self._pressed = False
         self._stale_steps = 0
         self._solved_at = 0.0
         self._solved_load: Array = sockets
         self._solve(0.0)
-        self._passive_start: Array = self._bank.motor_mm.copy()
 
     def step(self, t_s: float, target_mm: Array, powered: NDArray[np.bool_], braked: NDArray[np.bool_]) -> None:
         """Ramp the motor set-points to `target_mm` (m,), reached at `t_s`; `powered` and `braked` (m,) apply from now.
 
-        Unpowered axes ignore their target; passive axes ignore everything and float with the component.
+        Unpowered axes ignore their target; passive axes ignore everything and float with the component. So do axes that
+        press (see `press`), until they hold their position again.
         """
         if self._epoch_s is None:
             self._epoch_s = self._t_s = t_s
             return
-        self._moved = self._bank.step(t_s - self._t_s, target_mm, powered, braked)
+        dt_s = t_s - self._t_s
+        if self._has_followers:
+            target_mm = self._followers.motor_mm(target_mm)
+        self._moved = self._bank.step(dt_s, target_mm, powered, braked) or self._pressed
+        if self._has_followers and dt_s > 0.0:
+            self._moved = self._followers.run_away(dt_s, self._high_mm) or self._moved
+            self._pressed = False
         if t_s > self._t_s:
             self._t_s = t_s
         if self._moved:
             self._encoder = None
             self._stale_steps += 1
+        if self._has_followers and dt_s > 0.0:
+            self._followers.note(self.encoder_mm(), dt_s)
+
+    def press(self, force_n: Array, v_max_mm_s: Array) -> None:
+        """Let axes exert these forces (m,) from now on instead of holding a position; NaN for axes that hold one.
+
+        `v_max_mm_s` (m,) bounds the speed of an axis that meets no resistance.
+        """
+        # The slips up to now decide where an axis stands that holds its position from now on.
+        self._solve(self.elapsed_s(self._t_s))
+        self._followers.press(force_n, v_max_mm_s)
+        self._stale_steps, self._pressed, self._encoder = self._stale_steps + 1, True, None
 
     def encoder_mm(self) -> Array:
         """Encoder positions (m,), motor side, quantised. Read-only; the same array until something moves."""
@@ -181,6 +203,18 @@ class Plant:
         """Free a jammed or creeping axis."""
         self._seize(axis, False)
 
+    def lose_ball(self, axis: str) -> None:
+        """Lift the ball out of the socket of a force-controlled axis: it presses against nothing.
+
+        Raises ValueError for any other axis.
+        """
+        index = self.axes.index(axis)
+        if not self._followers.mask[index]:
+            raise ValueError(f"{axis} holds no force")
+        self._solve(self.elapsed_s(self._t_s))
+        self._followers.lose(index, float(self.encoder_mm()[index]))
+        self._stale_steps, self._pressed, self._encoder = self._stale_steps + 1, True, None
+
     def creep(self, axis: str, speed_mm_s: float) -> None:
         """Let a driven axis move whatever its servo and brake want: drift, slipping brake, runaway."""
         self._bank.seize(self._driven(axis), True, speed_mm_s)
@@ -203,7 +237,11 @@ class Plant:
 
     def _seize(self, axis: str, jammed: bool) -> None:
         index = self.axes.index(axis)
-        if self._passive[index]:
+        if self._followers.mask[index]:
+            self._solve(self.elapsed_s(self._t_s))
+            self._followers.jam(index, jammed)
+            self._stale_steps += 1
+        elif self._passive[index]:
             self._equilibrium.lock(index, jammed)
             self._stale_steps += 1
         else:
@@ -246,8 +284,8 @@ class Plant:
         if self._stale_steps > _PASSIVE_STEPS:
             self._solve(self.elapsed_s(self._t_s))
         slide = self._equilibrium.passive_shift_mm(self._bank.load_mm() - self._solved_load)
-        position: Array = self._passive_start + self._equilibrium.slip_mm + slide
-        return position
+        position: Array = self._bank.motor_mm + self._equilibrium.slip_mm + slide
+        return self._followers.shown_mm(position) if self._has_followers else position
 
     def _carries(self, index: int) -> bool:
         """True while the vertical axis `index` bears load."""

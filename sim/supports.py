@@ -54,6 +54,8 @@ def true_supports(cell: CellFile, truth: TruthFile, draws: Draws) -> tuple[Suppo
     half_play = 0.5e-3 * draws.span("ball_clearance", truth.ball_clearance.um, (len(cell.positioners),))
     clearance = np.where(driven, np.where(down == 0.0, np.repeat(half_play, 3), 0.0), np.inf)
     friction = np.where(driven, truth.ball_clearance.friction_n, truth.drives.passive_friction_n)
+    held = np.array([axis.force_n or 0.0 for p in cell.positioners for axis in p.axes])
+    friction = np.where(held > 0.0, truth.drives.follower_friction * held, friction)
     supports = Supports(
         rows=np.asarray(np.linalg.inv(directions), dtype=np.float64).reshape(-1, 3),
         origin_mm=origins,
@@ -61,6 +63,7 @@ def true_supports(cell: CellFile, truth: TruthFile, draws: Draws) -> tuple[Suppo
         friction_n=np.where(driven & (down != 0.0), np.inf, friction),
         clearance_mm=clearance,
         driven=driven,
+        held_n=held,
     )
     return supports, down
 
@@ -89,5 +92,5 @@ def true_axes(cell: CellFile, truth: TruthFile, draws: Draws, down: Array) -> Ax
         down=down,
         brake_mm_s2=drives.brake_mm_s2,
         back_drive_mm_s2=drives.back_drive_mm_s2,
-        driven=driven,
+        driven=np.array(cell.powered, dtype=bool),
     )

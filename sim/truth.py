@@ -196,7 +196,7 @@ class Misalignment(Model):
 
 class Drives(Model):
     """Servo drives and brakes as they really are; drives on CAN react as `sync_loss` says to `sync_loss_cycles` without
-    SYNC."""
+    SYNC. `follower_friction` is of the force that a force-controlled axis holds."""
 
     servo_lag_s: Positive
     servo_lag_spread: NonNegative
@@ -206,6 +206,7 @@ class Drives(Model):
     brake_mm_s2: Positive
     back_drive_mm_s2: NonNegative
     passive_friction_n: Positive
+    follower_friction: NonNegative = 0.005
     sync_loss: Literal["hold", "ignore", "extrapolate", "quick-stop", "fault"]
     sync_loss_cycles: Positive = 3.0
 
