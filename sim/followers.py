@@ -28,6 +28,7 @@ class Followers:
         self._shown: Array = np.full(len(mask), np.nan)
         self._speed: Array = np.zeros(len(mask))
         self._v_max: Array = np.zeros(len(mask))
+        self._force_n: Array = np.zeros(len(mask))
         for index in np.flatnonzero(mask).tolist():
             equilibrium.lock(index, True)
 
@@ -36,7 +37,8 @@ class Followers:
         it went. `v_max_mm_s` (m,) is how fast an axis may become that meets no resistance."""
         before, self.pressing = self.pressing, np.isfinite(force_n) & self.mask
         self._v_max = v_max_mm_s
-        self._equilibrium.hold(np.where(self.pressing, np.nan_to_num(force_n), 0.0))
+        self._force_n = np.where(self.pressing, np.nan_to_num(force_n), 0.0)
+        self._hold()
         self._bank.let_go(self.pressing)
         for index in np.flatnonzero(self.mask).tolist():
             self._relock(index)
@@ -53,6 +55,7 @@ class Followers:
         """The ball is lifted out of the socket of an axis that stands at `position_mm`."""
         self._lost[index] = position_mm
         self._equilibrium.part(index)
+        self._hold()
 
     def run_away(self, dt_s: float, end_mm: Array) -> bool:
         """Let the axes run that press against nothing, up to `end_mm` (m,); True when one moved."""
@@ -78,6 +81,12 @@ class Followers:
         """Keep how fast the axes go, for one that shall hold its position the next moment."""
         self._speed = np.nan_to_num(encoder_mm - self._shown) / dt_s
         self._shown = encoder_mm
+
+    def _hold(self) -> None:
+        """Only what touches the component presses on it."""
+        touching = self._force_n.copy()
+        touching[list(self._lost)] = 0.0
+        self._equilibrium.hold(touching)
 
     def _relock(self, index: int) -> None:
         if index not in self._lost:
