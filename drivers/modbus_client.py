@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import struct
+from collections.abc import Callable
 
 from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.pdu import ModbusPDU
@@ -57,10 +58,12 @@ class ModbusUnit:
 
     Every request ends within `timeout_s`: DeviceSilent for a read, OutcomeUnknown for anything that writes,
     DeviceRefused on an exception reply, BadReply on a reply that does not fit, LinkLost when the connection breaks.
+    `on_lost` is called when the connection breaks, whether a request waits or not.
     """
 
     def __init__(self, where: str, host: str, port: int, unit: int, timeout_s: float) -> None:
         self.where, self._unit, self._timeout_s = where, unit, timeout_s
+        self.on_lost: Callable[[], None] = lambda: None
         self._address = f"{host}:{port}"
         self._request: _Request | None = None
         self._reply: asyncio.Future[tuple[int, bytes]]
@@ -86,6 +89,7 @@ class ModbusUnit:
             raise PortMissing(self.where, f"no Modbus TCP server answered within {CONNECT_S} s", value=self._address)
 
     def close(self) -> None:
+        self.on_lost = lambda: None
         self._client.close()
 
     async def read(self, address: int, count: int) -> bytes:
@@ -185,6 +189,7 @@ class ModbusUnit:
     def _connection(self, up: bool) -> None:
         if not up:
             self._fail(LinkLost(self.where, f"{self._address} closed the connection"))
+            self.on_lost()
 
     def _fail(self, error: Exception) -> None:
         """End the pending request at once."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections import deque
-from collections.abc import Awaitable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from typing import TypeVar, cast
 
 import numpy as np
@@ -61,10 +61,10 @@ class _Watch:
 def _shown(plc: PositionerPlc) -> AxisState:
     """What the driven axes of this PLC are doing."""
     state = plc.state
-    if state == "fault" or plc.status.head["fault"]:
-        return AxisState.FAULT
     if state == "stopping":
         return AxisState.STOPPING
+    if state == "fault" or plc.fault:
+        return AxisState.FAULT
     return AxisState.ENABLED if state in _MOVING else AxisState.DISABLED
 
 
@@ -78,6 +78,8 @@ class ModbusPositioners:
         if not isinstance(cell.bus, ModbusBus):
             raise BadArgument("bus", "this cell has no Modbus positioners", value=cell.bus.kind)
         self._cell, self._bus = cell, cell.bus
+        self._driven = np.array(cell.driven)
+        self._a_quick = np.array([axis.a_quick_mm_s2 for p in cell.positioners for axis in p.axes])
         self.axes = cell.axis_names
         self.segment_s = self._bus.segment_s
         self._map = load_map(self._bus.map)
@@ -89,32 +91,49 @@ class ModbusPositioners:
         self._watches: tuple[_Watch, ...] = ()
         self._alone = asyncio.Lock()
         self.path_spread_s = float("nan")
+        self.on_lost: Callable[[], None] = lambda: None
+        self._stuck_mm = cell.limits.stuck_mm
+        self._quick_ramp_s, self._rate = self._bus.ramp_s, 1.0
         um = 1.0 / self._map.scale["position_per_mm"]
         self._units = np.array([[um], [um], [self._map.scale["force_n"]]])
         self._shown: list[AxisState] = []
         self._axis_states: tuple[AxisState, ...] = ()
 
     async def bring_up(self) -> tuple[Identity, ...]:
-        """Connect to every PLC, prove identity, watchdog, ramp and strokes; axes stay disabled."""
+        """Connect to every PLC, prove identity, scan, settings and strokes; axes stay disabled."""
         self._plcs = tuple(
             PositionerPlc(p, self._bus, self._map, self._addresses[p.name]) for p in self._cell.positioners
         )
         self._watches = tuple(_Watch() for _ in self._plcs)
-        return tuple(await self._all(plc.bring_up(self._min_fill) for plc in self._plcs))
+        settings = self._settings()
+        identities = tuple(await self._all(plc.bring_up(settings) for plc in self._plcs))
+        for plc in self._plcs:
+            plc.unit.on_lost = lambda: self.on_lost()
+        return identities
+
+    def _settings(self) -> dict[str, int]:
+        """The settings block by names of the map. A watchdog of 0 ms would be none."""
+        return {
+            "watchdog_ms": max(1, round(self._bus.watchdog_s * 1000.0)),
+            "ramp_ms": round(self._bus.ramp_s * 1000.0),
+            "min_fill": self._min_fill,
+            "stuck_um": round(self._stuck_mm * 1000.0),
+            "servo_lag_us": round(self._bus.servo_lag_s * 1e6),
+        }
 
     async def enable(self) -> Feedback:
         """Enable the driven axes where they stand; EnableFailed names a PLC that is in fault or does not follow."""
         async with self._alone:
             await self._all(plc.refresh() for plc in self._plcs)
-            for plc in self._plcs:
-                if plc.state == "fault":
-                    raise EnableFailed(plc.where, plc.fault_words(), value="fault")
+            ill = [plc for plc in self._plcs if plc.state == "fault"]
+            for plc in sorted(ill, key=lambda plc: plc.blames_another):
+                raise EnableFailed(plc.where, plc.fault_words(), value="fault")
             await self._all(plc.command("enable") for plc in self._plcs)
             await self._all(plc.reach(ENABLE_S, "enabled", "held", "done") for plc in self._plcs)
             return self._feedback()
 
     async def load(self, plan: Plan) -> None:
-        """Clear all queues and fill them with the start of `plan`. Nothing moves.
+        """Clear all queues, write the quick ramp of `plan` and fill them with its start. Nothing moves.
 
         Raises SegmentRejected when the plan does not begin at the read-back (0.01 mm) or a PLC rejects a segment.
         """
@@ -126,6 +145,8 @@ class ModbusPositioners:
             await self._all(plc.command("stop") for plc in self._plcs)
             await self._all(plc.reach(self._bus.ramp_s + ENABLE_S, "enabled") for plc in self._plcs)
             self._check_start(plan)
+            self._quick_ramp_s = self._quick_ramp_of(plan)
+            await self._set_motion()
             per_mm = self._map.scale["position_per_mm"]
             raw = np.rint(plan.q_mm * per_mm).astype(np.int64)
             for i, plc in enumerate(self._plcs):
@@ -133,8 +154,33 @@ class ModbusPositioners:
                 plc.take(Segments(plan.plan_id & 0xFFFFFFFF, round(self.segment_s * 1000), rows))
             await self._all(self._prefill(plc) for plc in self._plcs)
 
+    def _quick_ramp_of(self, plan: Plan) -> float:
+        """Time in which no axis brakes harder than its quick-stop deceleration from its peak speed in `plan`.
+
+        One time for all, so that all stop at one place of the path: max_i v_i / a_i, up to a whole scan, at least two.
+        """
+        peak_mm_s = np.abs(np.diff(plan.q_mm, axis=0)).max(axis=0) / plan.period_s
+        time_s = float(np.max((peak_mm_s / self._a_quick)[self._driven]))
+        scan_s = self._bus.scan_s
+        quick_s = max(2, math.ceil(time_s / scan_s - 1e-9)) * scan_s
+        if not quick_s <= self._bus.ramp_s:
+            cause = "An ordinary stop would be harder than the axes' quick stop."
+            raise BadArgument("ramp_s", cause, value=self._bus.ramp_s, limit=quick_s)
+        return quick_s
+
+    async def _set_motion(self) -> None:
+        await self._all(plc.set_motion(self._quick_ramp_s, self._rate) for plc in self._plcs)
+
+    async def override(self, rate: float) -> None:
+        """Playback rate (over 0, to 1) from the next run or resume on; path time must stand still."""
+        if not 0.0 < rate <= 1.0:
+            raise BadArgument("rate", "over 0, at most 1", value=rate, limit=1.0)
+        async with self._alone:
+            self._rate = rate
+            await self._set_motion()
+
     def _check_start(self, plan: Plan) -> None:
-        off_mm = np.where(self._cell.driven, np.abs(plan.q_mm[0] - self._position_mm()), 0.0)
+        off_mm = np.where(self._driven, np.abs(plan.q_mm[0] - self._position_mm()), 0.0)
         worst = int(np.argmax(off_mm))
         if not off_mm[worst] <= START_MM:
             cause = f"the plan begins {off_mm[worst]:.4f} mm from where the axis stands"
@@ -187,7 +233,14 @@ class ModbusPositioners:
         """
         async with self._alone:
             await self._all(self._cycle(plc, watch) for plc, watch in zip(self._plcs, self._watches, strict=True))
+            if any(plc.fault for plc in self._plcs) and self._ill() is None:
+                # Those that were read first show only that the line fell; the one that dropped it has its fault by now.
+                await asyncio.gather(*(plc.refresh() for plc in self._plcs), return_exceptions=True)
             return self._feedback()
+
+    def _ill(self) -> PositionerPlc | None:
+        """The first PLC with a fault of its own."""
+        return next((plc for plc in self._plcs if plc.fault and not plc.blames_another), None)
 
     async def _cycle(self, plc: PositionerPlc, watch: _Watch) -> None:
         try:
@@ -217,7 +270,7 @@ class ModbusPositioners:
     @staticmethod
     def _wants(plc: PositionerPlc, depth: int) -> bool:
         """True when the queue is shorter than `depth` and the PLC takes segments."""
-        return plc.waiting > 0 and plc.depth < depth and plc.state in _MOVING
+        return plc.waiting > 0 and plc.depth < depth and plc.state in _MOVING and not plc.fault
 
     async def close(self) -> None:
         """Disable all axes (ramp, brakes, power) and disconnect.
@@ -255,7 +308,8 @@ class ModbusPositioners:
             states=self._states(),
             age_cycles=np.repeat([float(watch.misses) for watch in self._watches], 3),
             path_time_s=min(times),
-            fault=next((fault for plc in self._plcs if (fault := self._fault(plc)) is not None), None),
+            fault=self._fault(),
+            at_limit=(words[3].astype(np.int64) & self._map.flags["axis_limit"]) != 0,
         )
 
     def _states(self) -> tuple[AxisState, ...]:
@@ -270,13 +324,14 @@ class ModbusPositioners:
             )
         return self._axis_states
 
-    def _fault(self, plc: PositionerPlc) -> tuple[str, int, str] | None:
-        code = plc.status.head["fault"]
-        if not code:
+    def _fault(self) -> tuple[str, int, str] | None:
+        """The fault that came first; one that another positioner caused only when nobody has the cause."""
+        plc = self._ill() or next((plc for plc in self._plcs if plc.fault), None)
+        if plc is None:
             return None
         bit = self._map.flags["axis_fault"]
         axes = plc.config.axes
         index = next((i for i, axis in enumerate(plc.status.axes) if axis[3] & bit), None)
         if index is None:
             index = next((i for i, axis in enumerate(axes) if axis.driven), 0)
-        return f"{plc.config.name}.{axes[index].name}", code, self._map.fault(code)
+        return f"{plc.config.name}.{axes[index].name}", plc.fault, plc.fault_words()

@@ -7,7 +7,9 @@ A segment is sent again only after a read-back has shown that the PLC does not h
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from binascii import crc_hqx
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -79,8 +81,11 @@ class PositionerPlc:
         self.status = Status({}, [])
 
     # identity and settings -----------------------------------------------------------------------------------------
-    async def bring_up(self, min_fill: int) -> Identity:
-        """Connect; prove who answers, the word order, the settings and the strokes; leave the axes disabled."""
+    async def bring_up(self, settings: Mapping[str, int]) -> Identity:
+        """Connect; prove who answers, word order, scan, settings and strokes; leave the axes disabled.
+
+        `settings` are the words of the settings block, by name and in its order.
+        """
         await self.unit.connect()
         identity = await self._prove_identity()
         await self.refresh()
@@ -88,7 +93,7 @@ class PositionerPlc:
             await self.command("disable")
             await self.reach(ENABLE_S, "disabled")
         if self.state == "disabled":
-            await self._prove_settings(min_fill)
+            await self._write_back("settings", settings)
         await self._prove_strokes()
         return identity
 
@@ -103,22 +108,29 @@ class PositionerPlc:
         for key, wanted in (("station", self.config.name), ("map_version", self._map.version), ("n_axes", 3)):
             if head[key] != wanted:
                 raise WrongIdentity(self.where, f"Compared: {key}.", value=head[key], limit=wanted)
+        if head["scan_ms"] != round(self._bus.scan_s * 1000.0):
+            raise ReadBackMismatch(f"{self.where}, scan_ms", value=head["scan_ms"], limit=self._bus.scan_s * 1000.0)
         self.capacity = head["capacity"]
         return Identity(self.where, head["vendor"], head["product"], head["serial"], head["firmware"])
 
-    async def _prove_settings(self, min_fill: int) -> None:
-        """Write watchdog, ramp and smallest fill; each must read back as written."""
-        wanted = {
-            "watchdog_ms": round(self._bus.watchdog_s * 1000),
-            "ramp_ms": round(self._bus.ramp_s * 1000),
-            "min_fill": min_fill,
-        }
-        block = self._blocks["settings"]
-        await self.unit.write(block.address, block.pack(*wanted.values()))
-        head, _ = await self._read_block("settings")
+    async def _write_back(self, name: str, wanted: Mapping[str, int]) -> None:
+        """Write the block `name` and see that it reads back as written.
+
+        A write whose reply is lost needs no second one: the read-back shows whether it arrived, and a setting that
+        did not arrive raises ReadBackMismatch before anything moves.
+        """
+        block = self._blocks[name]
+        with contextlib.suppress(OutcomeUnknown):
+            await self.unit.write(block.address, block.pack(*wanted.values()))
+        head, _ = await self._read_block(name)
         for key, value in wanted.items():
-            if head[key] != value or value == 0:
+            if head[key] != value:
                 raise ReadBackMismatch(f"{self.where}, {key}", value=head[key], limit=value)
+
+    async def set_motion(self, quick_ramp_s: float, rate: float) -> None:
+        """At standstill: how long a quick stop takes from rate 1, and the playback rate (over 0, to 1)."""
+        permille = max(1, round(rate * self._map.scale["full_rate"]))
+        await self._write_back("motion", {"quick_ramp_ms": round(quick_ramp_s * 1000.0), "rate_permille": permille})
 
     async def _prove_strokes(self) -> None:
         _, axes = await self._read_block("limits")
@@ -166,8 +178,18 @@ class PositionerPlc:
             await asyncio.sleep(2.0 * LOOK_AGAIN_S)
             await self.refresh()
 
+    @property
+    def fault(self) -> int:
+        """Fault code; 0 is none."""
+        return self.status.head.get("fault", 0)
+
+    @property
+    def blames_another(self) -> bool:
+        """True when it is in fault only because another positioner is."""
+        return self.fault in self._map.consequences
+
     def fault_words(self) -> str:
-        return self._map.fault(self.status.head["fault"])
+        return self._map.fault(self.fault)
 
     # commands ------------------------------------------------------------------------------------------------------
     async def command(self, verb: str) -> None:
@@ -231,7 +253,7 @@ class PositionerPlc:
         sequence = self._number(self.pushed + 1)
         await self._beat_and_read(self._blocks["heartbeat"].address, self._window(self._segments, sequence))
         rejected = self.status.head["seg_result"]
-        if self.status.head["fault"]:
+        if self.fault:
             return None
         if rejected:
             where = f"{self.where}, segment {self.pushed + 1}"

@@ -58,6 +58,7 @@ class RegisterMap:
         self.flags: dict[str, int] = table["flags"]
         self.commands: dict[str, int] = table["commands"]
         self.states: dict[int, str] = {code: name for name, code in table["states"].items()}
+        self.consequences: frozenset[int] = frozenset(table["consequences"]["faults"])
         self._faults: dict[str, str] = table["faults"]
         self._rejects: dict[str, str] = table["rejects"]
         self.blocks = {

@@ -1,1 +1,1 @@
-"""The far end of the Modbus wires: positioner PLCs with a segment FIFO and one common RUN line, around one plant."""
+"""The far end of the Modbus wires: positioner PLCs with a segment FIFO and two common lines, around one plant."""

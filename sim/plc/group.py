@@ -1,7 +1,7 @@
-"""All positioner PLCs of a cell around one plant: one scan every 10 ms, one common RUN line, one server a positioner.
+"""All positioner PLCs of a cell around one plant: one scan every 10 ms, two common lines, one server a positioner.
 
-The RUN line is wired AND: it is high only while every PLC releases it. All PLCs see an edge in the same scan; their
-clocks differ, so their path times drift apart by the difference of `clock_ppm`.
+RUN and GROUP_OK are wired AND: each is high only while every PLC releases it. All PLCs see an edge in the same scan;
+their clocks differ, so their path times drift apart by the difference of `clock_ppm`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from docking.config.cell import CellFile
 from sim.plc.modbus_tcp import ModbusTcpConnection
 from sim.plc.playback import Point
-from sim.plc.positioner import SCAN_S, PositionerPlc
+from sim.plc.positioner import SCAN_S, Lines, PositionerPlc
 from sim.plc.registers import AXES, State
 from sim.plc.sensors import PlantView, Readings, Sensors
 
@@ -102,10 +102,27 @@ class PlcGroup:
 
     def drop_connections(self, name: str) -> None:
         """Cut every connection to the positioner `name` (fault injection)."""
-        plc = next(plc for p, plc in zip(self._cell.positioners, self.plcs, strict=True) if p.name == name)
+        plc = self._plc_of(name)
         for connection in tuple(self._connections):
             if connection.serves(plc):
                 connection.close()
+
+    def press_limit(self, axis: str, pressed: bool = True) -> None:
+        """Set the limit switch of `axis` (fault injection)."""
+        plc, index = self._axis(axis)
+        plc.guard.limit[index] = pressed
+
+    def fail_drive(self, axis: str, failed: bool = True) -> None:
+        """Have the drive of `axis` report a fault (fault injection)."""
+        plc, index = self._axis(axis)
+        plc.guard.drive_fault[index] = failed
+
+    def _axis(self, axis: str) -> tuple[PositionerPlc, int]:
+        number, index = divmod(self._cell.axis_names.index(axis), AXES)
+        return self.plcs[number], index
+
+    def _plc_of(self, name: str) -> PositionerPlc:
+        return next(plc for p, plc in zip(self._cell.positioners, self.plcs, strict=True) if p.name == name)
 
     def _schedule(self) -> None:
         # On a real loop a late scan is followed by the next one on the grid; a long pause is not made up for.
@@ -121,9 +138,12 @@ class PlcGroup:
         dt_s, self._before_s = now_s - self._before_s, now_s
         for plc in self.plcs:
             plc.think(now_s)
-        line_high = all(plc.releases_run_line for plc in self.plcs)
+        lines = Lines(
+            run=all(plc.releases_run_line for plc in self.plcs),
+            group_ok=all(plc.releases_group_line for plc in self.plcs),
+        )
         for plc, rate in self._clocked:
-            plc.play(line_high, now_s, dt_s * rate)
+            plc.play(lines, now_s, dt_s * rate)
         self._draw()
         self._plant.step(now_s, self._target_mm, self._powered, self._braked)
         self._readings.next_scan()

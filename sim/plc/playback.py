@@ -1,7 +1,7 @@
 """The segment FIFO of one PLC: knots on an even grid of path time, played along straight chords between them.
 
 Path time runs at `rate` times the PLC's own clock. Every start and stop changes the rate only, linearly in time with
-1/`ramp_s`, so the axes leave the chords at no rate.
+1/`ramp_s` or, in a quick stop, 1/`quick_ramp_s`: the axes leave the chords at no rate.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ class Playback:
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
-        self.ramp_s = 0.5
+        self.ramp_s = self.quick_ramp_s = 0.5
         self.play_seq = 0
         self.fraction = 0.0
         self.clear()
@@ -32,6 +32,7 @@ class Playback:
         self.rate = 0.0
         self.goal = 0.0
         self.lead_s = 0.0
+        self._slope_s = self.ramp_s
 
     @property
     def free(self) -> int:
@@ -52,6 +53,10 @@ class Playback:
         """Path time that a stop from the present rate takes: rate^2 ramp / 2."""
         return 0.5 * self.rate * self.rate * self.ramp_s
 
+    def runs_dry(self, margin_s: float) -> bool:
+        """True when a stop begun within `margin_s` from now would come to the last knot before the plan's end."""
+        return not self.complete and self.remaining_s <= self.stopping_s + margin_s
+
     def push(self, knot: Point, last: bool) -> None:
         """Append the knot after `last_seq`."""
         self.last_seq = following(self.last_seq)
@@ -60,12 +65,14 @@ class Playback:
         self.knots.append(knot)
         self.complete = last
 
-    def start(self, rate: float, late_s: float) -> None:
-        """Let path time run: at once with `rate`, rising to 1; the first `late_s` are lost (skew of the start edge)."""
-        self.rate, self.goal, self.lead_s = rate, 1.0, -late_s
+    def start(self, rate: float, goal: float, late_s: float) -> None:
+        """Let path time run: at once with `rate`, rising to `goal`; the first `late_s` are lost (skew of the edge)."""
+        self.rate, self.goal, self.lead_s = rate, goal, -late_s
+        self._slope_s = self.ramp_s
 
-    def stop(self) -> None:
-        """Ramp the rate down to zero."""
+    def stop(self, quick: bool = False) -> None:
+        """Ramp the rate down to zero; a quick stop makes a ramp steeper, an ordinary one never flatter."""
+        self._slope_s = min(self._slope_s, self.quick_ramp_s) if quick else self._slope_s
         self.goal = 0.0
 
     def advance(self, dt_s: float) -> None:
@@ -86,7 +93,7 @@ class Playback:
         rate, goal = self.rate, self.goal
         if rate == goal:
             return rate * dt_s
-        ramp_s = abs(goal - rate) * self.ramp_s
+        ramp_s = abs(goal - rate) * self._slope_s
         if ramp_s <= dt_s:
             self.rate = goal
             return 0.5 * (rate + goal) * ramp_s + goal * (dt_s - ramp_s)

@@ -1,16 +1,19 @@
 """One positioner PLC: its registers and what it does with them in each scan.
 
 Power and brakes: power on, then brakes open; to disable: standstill, brakes closed, then power off. Every stop is a
-ramp of the playback rate; while stopping the PLC holds the common RUN line low, so all the others ramp too.
+ramp of the playback rate. Two lines are common to all PLCs, each high only while all release it: a PLC that stops holds
+RUN low, and all ramp and wait; one with an axis in fault drops GROUP_OK, and all take the quick ramp, brake and go off.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from docking.config.cell import PositionerConfig
 from sim.plc import registers as reg
+from sim.plc.axes import AxisGuard
 from sim.plc.modbus_tcp import ILLEGAL_ADDRESS, ILLEGAL_VALUE, ModbusRefusal
 from sim.plc.playback import Playback, Point
 from sim.plc.registers import Command, Fault, Reject, State
@@ -25,6 +28,14 @@ STANDSTILL_S = 0.1
 RELEASING = frozenset((State.ARMED, State.RUNNING, State.DONE))
 POWERED = frozenset(State) - {State.DISABLED, State.FAULT}
 UNBRAKED = POWERED - {State.ENABLING, State.DISABLING}
+STANDING = frozenset((State.DISABLED, State.ENABLED, State.HELD, State.DONE))
+
+
+class Lines(NamedTuple):
+    """The two common lines, high or low, as all PLCs see them in one scan."""
+
+    run: bool
+    group_ok: bool
 
 
 @dataclass
@@ -34,6 +45,12 @@ class Settings:
     watchdog_ms: int = 0
     ramp_ms: int = 500
     min_fill: int = 2
+    stuck_um: int = 20
+    servo_lag_us: int = 0
+
+    def possible(self) -> bool:
+        in_time = self.watchdog_ms <= 5000 and 50 <= self.ramp_ms <= 5000
+        return in_time and 2 <= self.min_fill <= CAPACITY and self.stuck_um >= 1
 
 
 class PositionerPlc:
@@ -47,10 +64,12 @@ class PositionerPlc:
         clock: Callable[[], float],
         late_s: float = 0.0,
     ) -> None:
-        self._config, self._sensors, self._trip_mm, self._clock, self._late_s = config, sensors, trip_mm, clock, late_s
+        self._config, self._sensors, self._clock, self._late_s = config, sensors, clock, late_s
         self._gate = SegmentGate(config)
+        self.guard = AxisGuard(self._gate.driven, sensors, trip_mm)
         self.queue = Playback(CAPACITY)
         self.settings = Settings()
+        self._quick_ramp_ms, self._rate_permille = self.settings.ramp_ms, reg.FULL_RATE
         self.state, self.fault = State.DISABLED, Fault.NONE
         self.braked = True
         self.target_mm: Point = sensors.point_mm()
@@ -62,7 +81,8 @@ class PositionerPlc:
         self._command_ack = 0
         self._pending: tuple[int, int, int] | None = None
         self._heartbeat, self._heartbeat_s, self._heartbeat_seen = 0, clock(), False
-        self._line_high = False
+        self._lines = Lines(run=False, group_ok=True)
+        self._drops_group = False
         self._fault_axis = -1
         self._start_rate = 0.0
         self._scans = 0
@@ -85,6 +105,7 @@ class PositionerPlc:
         """Registers of one block; a span that leaves its block is refused."""
         for start, block in (
             (reg.STATUS_AT, self._status),
+            (reg.MOTION_AT, self._motion_block),
             (reg.SETTINGS_AT, self._settings_block),
             (reg.IDENTITY_AT, lambda: self._identity),
             (reg.LIMITS_AT, lambda: self._limits),
@@ -106,7 +127,9 @@ class PositionerPlc:
         elif address == reg.SEGMENT_AT and len(data) == reg.SEGMENT_BYTES:
             self._take_segment(data)
         elif address == reg.SETTINGS_AT and len(data) == reg.SETTINGS.size:
-            self._set(*reg.SETTINGS.unpack(data))
+            self._set(Settings(*reg.SETTINGS.unpack(data)))
+        elif address == reg.MOTION_AT and len(data) == reg.MOTION.size:
+            self._set_motion(*reg.MOTION.unpack(data))
         else:
             raise ModbusRefusal(ILLEGAL_ADDRESS)
 
@@ -114,12 +137,21 @@ class PositionerPlc:
         if count != self._heartbeat:
             self._heartbeat, self._heartbeat_s, self._heartbeat_seen = count, self._clock(), True
 
-    def _set(self, watchdog_ms: int, ramp_ms: int, min_fill: int) -> None:
-        possible = watchdog_ms <= 5000 and 50 <= ramp_ms <= 5000 and 2 <= min_fill <= CAPACITY
-        if self.state is not State.DISABLED or not possible:
+    def _set(self, settings: Settings) -> None:
+        if self.state is not State.DISABLED or not settings.possible():
             raise ModbusRefusal(ILLEGAL_VALUE)
-        self.settings = Settings(watchdog_ms, ramp_ms, min_fill)
-        self.queue.ramp_s = ramp_ms / 1000.0
+        self.settings = settings
+        self.queue.ramp_s = settings.ramp_ms / 1000.0
+        self.guard.stuck_mm, self.guard.lag_s = settings.stuck_um / 1000.0, settings.servo_lag_us / 1e6
+        self._set_motion(min(self._quick_ramp_ms, settings.ramp_ms), self._rate_permille)
+
+    def _set_motion(self, quick_ramp_ms: int, rate_permille: int) -> None:
+        """Quick ramp and rate, only while path time stands still: on the way they would differ for a scan."""
+        possible = 2000.0 * SCAN_S <= quick_ramp_ms <= self.settings.ramp_ms and 1 <= rate_permille <= reg.FULL_RATE
+        if self.state not in STANDING or not possible:
+            raise ModbusRefusal(ILLEGAL_VALUE)
+        self._quick_ramp_ms, self._rate_permille = quick_ramp_ms, rate_permille
+        self.queue.quick_ramp_s = quick_ramp_ms / 1000.0
 
     def _take_segment(self, data: bytes) -> None:
         """Enter the segment, absorb a repetition of the last one, or say why not."""
@@ -139,11 +171,15 @@ class PositionerPlc:
 
     def _settings_block(self) -> bytes:
         s = self.settings
-        return reg.SETTINGS.pack(s.watchdog_ms, s.ramp_ms, s.min_fill)
+        return reg.SETTINGS.pack(s.watchdog_ms, s.ramp_ms, s.min_fill, s.stuck_um, s.servo_lag_us)
+
+    def _motion_block(self) -> bytes:
+        return reg.MOTION.pack(self._quick_ramp_ms, self._rate_permille)
 
     def _status(self) -> bytes:
         queue = self.queue
-        flags = reg.STATUS_RUN_LINE * self._line_high | reg.STATUS_WATCHDOG_ARMED * self._watchdog_armed
+        flags = reg.STATUS_RUN_LINE * self._lines.run | reg.STATUS_GROUP_LINE * self._lines.group_ok
+        flags |= reg.STATUS_WATCHDOG_ARMED * self._watchdog_armed
         head = reg.STATUS_HEAD.pack(
             self._scans & 0xFFFF, self._heartbeat, self.state, self.fault,
             self._command_ack, self._command_result, self._plan_id, queue.last_seq, queue.play_seq,
@@ -158,7 +194,7 @@ class PositionerPlc:
         bits = [live if i in self._gate.driven else reg.AXIS_PASSIVE for i in range(reg.AXES)]
         if self._fault_axis >= 0:
             bits[self._fault_axis] |= reg.AXIS_FAULT
-        return bits
+        return [b | reg.AXIS_LIMIT * pressed for b, pressed in zip(bits, self.guard.limit, strict=True)]
 
     # scan ----------------------------------------------------------------------------------------------------------
     @property
@@ -171,8 +207,13 @@ class PositionerPlc:
 
     @property
     def releases_run_line(self) -> bool:
-        """False while this PLC pulls the common line low."""
+        """False while this PLC pulls the RUN line low."""
         return self.state in RELEASING
+
+    @property
+    def releases_group_line(self) -> bool:
+        """False while this PLC pulls the GROUP_OK line low."""
+        return not self._drops_group
 
     def think(self, now_s: float) -> None:
         """First half of a scan: commands, watchdogs, timers."""
@@ -195,18 +236,24 @@ class PositionerPlc:
         elif state is not State.ENABLED:
             self._supervise(now_s)
 
-    def play(self, line_high: bool, now_s: float, dt_s: float) -> None:
-        """Second half of a scan, with the RUN line as all PLCs see it: `dt_s` of this PLC's clock pass."""
-        self._line_high = line_high
-        if self.state is State.ARMED and line_high:
+    def play(self, lines: Lines, now_s: float, dt_s: float) -> None:
+        """Second half of a scan, with the lines as all PLCs see them: `dt_s` of this PLC's clock pass."""
+        self._lines = lines
+        if not (lines.group_ok or self._drops_group) and self.state in POWERED and self.state is not State.DISABLING:
+            self._trip(Fault.GROUP_LINE, now_s)
+        if self.state is State.ARMED and lines.run:
             self._enter(State.RUNNING, now_s)
-            self.queue.start(self._start_rate, self._late_s)
+            goal = self._rate_permille / reg.FULL_RATE
+            self.queue.start(self._start_rate * goal, goal, self._late_s)
+            self.guard.commanded(self.target_mm, self.target_mm, 0.0)
             return
-        if self.state is State.RUNNING and not line_high:
+        if self.state is State.RUNNING and not lines.run:
             self._stop(State.HELD, now_s)
         if self.state is State.RUNNING or self.state is State.STOPPING:
+            before_mm = self.target_mm
             self.queue.advance(dt_s)
             self.target_mm = self.queue.point()
+            self.guard.commanded(before_mm, self.target_mm, dt_s)
             self._settle(now_s)
 
     def _settle(self, now_s: float) -> None:
@@ -224,35 +271,31 @@ class PositionerPlc:
         return not (now_s - self._heartbeat_s) * 1000.0 <= self.settings.watchdog_ms
 
     def _supervise(self, now_s: float) -> None:
-        """Faults of an enabled PLC."""
-        if self.fault:
-            return
-        state, queue = self.state, self.queue
+        """Faults of an enabled PLC; an axis that fails in a ramp makes it a quick one."""
+        state = self.state
         if state is State.ARMED:
             if now_s - self._since_s > RUN_LINE_WAIT_S:
                 self._trip(Fault.RUN_LINE, now_s)
-        elif state is State.RUNNING and not queue.complete and queue.remaining_s <= queue.stopping_s + 2.0 * SCAN_S:
-            self._trip(Fault.UNDERRUN, now_s)
-        elif state is State.RUNNING or state is State.STOPPING:
-            self._check_following(now_s)
-
-    def _check_following(self, now_s: float) -> None:
-        if not self._sensors.strays(self._trip_mm):
-            return
-        errors = self._sensors.following_error_mm()
-        for i in self._gate.driven:
-            if not abs(errors[i]) <= self._trip_mm:
-                self._fault_axis = i
-                self._trip(Fault.FOLLOWING_ERROR, now_s)
-                return
+        elif (state is State.RUNNING or state is State.STOPPING) and not self._drops_group:
+            found = self.guard.complaint()
+            if found is not None:
+                self._fault_axis = found[1]
+                self._trip(found[0], now_s)
+            elif state is State.RUNNING and self.queue.runs_dry(2.0 * SCAN_S):
+                self._trip(Fault.UNDERRUN, now_s)
 
     def _enter(self, state: State, now_s: float) -> None:
         self.state, self._since_s = state, now_s
+        self._drops_group = self._drops_group or (state is State.DISABLING and self.fault is not Fault.NONE)
         if state is not State.DISABLING:
             self.braked = state not in UNBRAKED
 
     def _trip(self, fault: Fault, now_s: float) -> None:
-        self.fault = fault
+        """Stop, brake and switch off; the first fault is the one that is kept."""
+        self.fault = self.fault or fault
+        if fault not in reg.RAMPED:
+            self._drops_group = True
+            self.queue.stop(quick=True)
         self._stop(State.DISABLING, now_s)
 
     def _stop(self, then: State, now_s: float, clear: bool = False) -> None:
@@ -300,6 +343,8 @@ class PositionerPlc:
             return Reject.MASK
         if not self._watchdog_armed:
             return Reject.WATCHDOG
+        if not self._lines.group_ok:
+            return Reject.GROUP_LINE
         if self.state is State.DISABLED:
             self.target_mm = self._sensors.point_mm()
             self.queue.clear()
@@ -324,7 +369,7 @@ class PositionerPlc:
     def _reset(self, now_s: float) -> Reject:
         if self.state is not State.FAULT:
             return Reject.STATE
-        self.fault, self._fault_axis = Fault.NONE, -1
+        self.fault, self._fault_axis, self._drops_group = Fault.NONE, -1, False
         self._enter(State.DISABLED, now_s)
         return Reject.NONE
 
@@ -340,6 +385,8 @@ class PositionerPlc:
             if state is State.ENABLING:
                 return Reject.STATE
             self._stop(State.ENABLED, now_s, clear=True)
+        elif command is Command.QUICK_STOP:
+            self._trip(Fault.QUICK_STOP, now_s)
         else:
             self._stop(State.DISABLING, now_s, clear=True)
         return Reject.NONE

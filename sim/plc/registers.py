@@ -10,7 +10,7 @@ from binascii import crc_hqx
 from enum import IntEnum
 
 AXES = 3
-MAP_VERSION = 1
+MAP_VERSION = 2
 MAGIC = 0x12345678
 
 COMMAND_AT, COMMAND = 0x00, struct.Struct(">HHH")
@@ -23,8 +23,11 @@ SEGMENT_POINT = struct.Struct(f">{AXES}i")
 SEGMENT_BYTES = SEGMENT_HEAD.size + SEGMENT_CRC.size + SEGMENT_POINT.size
 FLAG_LAST = 1
 
-SETTINGS_AT, SETTINGS = 0x40, struct.Struct(">HHH")
-"""watchdog_ms, ramp_ms, min_fill. Accepted only while disabled."""
+SETTINGS_AT, SETTINGS = 0x40, struct.Struct(">5H")
+"""watchdog_ms, ramp_ms, min_fill, stuck_um, servo_lag_us. Accepted only while disabled."""
+
+MOTION_AT, MOTION = 0x50, struct.Struct(">HH")
+"""quick_ramp_ms, rate_permille. Accepted only while path time stands still."""
 
 STATUS_AT = 0x100
 STATUS_HEAD = struct.Struct(">6HI7H")
@@ -41,8 +44,9 @@ LIMITS_AT, LIMITS = 0x240, struct.Struct(">3i")
 
 NO_FORCE = -0x8000
 FRACTION = 0x10000
-AXIS_POWERED, AXIS_BRAKED, AXIS_PASSIVE, AXIS_FAULT = 1, 2, 4, 8
-STATUS_RUN_LINE, STATUS_WATCHDOG_ARMED = 1, 2
+FULL_RATE = 1000
+AXIS_POWERED, AXIS_BRAKED, AXIS_PASSIVE, AXIS_FAULT, AXIS_LIMIT = 1, 2, 4, 8, 16
+STATUS_RUN_LINE, STATUS_WATCHDOG_ARMED, STATUS_GROUP_LINE = 1, 2, 4
 
 
 class State(IntEnum):
@@ -81,6 +85,15 @@ class Fault(IntEnum):
     WATCHDOG = 2
     FOLLOWING_ERROR = 3
     RUN_LINE = 4
+    STUCK = 5
+    LIMIT = 6
+    DRIVE = 7
+    QUICK_STOP = 8
+    GROUP_LINE = 9
+
+
+RAMPED = frozenset((Fault.UNDERRUN, Fault.WATCHDOG, Fault.RUN_LINE))
+"""Faults that leave all axes in order: all ramp down over the RUN line before GROUP_OK falls."""
 
 
 class Reject(IntEnum):
@@ -104,6 +117,7 @@ class Reject(IntEnum):
     COMMAND_SEQUENCE = 23
     MASK = 24
     WATCHDOG = 25
+    GROUP_LINE = 26
 
 
 def crc16(data: bytes) -> int:

@@ -35,6 +35,8 @@ class Readings:
         self._scan = 0
         self._words_scan = self._force_scan = -FORCE_EVERY
         self._worst_scan, self._worst_mm = -1, 0.0
+        self._errors: Array | None = None
+        self._errors_before: Array | None = None
         self._measured = bool(has_force.any())
         self._force = [NO_FORCE] * len(has_force)
         self._rows: list[tuple[int, int, int]] = []
@@ -42,18 +44,26 @@ class Readings:
     def next_scan(self) -> None:
         """Forget what was converted: the plant has moved."""
         self._scan += 1
+        self._errors_before, self._errors = self._errors, None
 
     def encoder_mm(self) -> Array:
         return self._plant.encoder_mm()
 
     def following_error_mm(self) -> Array:
-        return self._plant.following_error_mm()
+        if self._errors is None:
+            self._errors = self._plant.following_error_mm()
+        return self._errors
+
+    def following_error_before_mm(self) -> Array:
+        """Those of the scan before; of this one when nobody asked then."""
+        before = self._errors_before
+        return self.following_error_mm() if before is None else before
 
     def worst_error_mm(self) -> float:
         """Largest following error of all axes in this scan."""
         if self._worst_scan != self._scan:
             self._worst_scan = self._scan
-            self._worst_mm = float(np.abs(self._plant.following_error_mm()).max())
+            self._worst_mm = float(np.abs(self.following_error_mm()).max())
         return self._worst_mm
 
     def rows(self) -> list[tuple[int, int, int]]:
@@ -61,7 +71,7 @@ class Readings:
         if self._words_scan != self._scan:
             self._words_scan = self._scan
             position = np.rint(self._plant.encoder_mm() * 1000.0).astype(np.int64).tolist()
-            error = _whole(self._plant.following_error_mm() * 1000.0).astype(np.int64).tolist()
+            error = _whole(self.following_error_mm() * 1000.0).astype(np.int64).tolist()
             self._rows = list(zip(position, error, self._forces(), strict=True))
         return self._rows
 
@@ -94,6 +104,10 @@ class Sensors:
 
     def following_error_mm(self) -> list[float]:
         result: list[float] = self._readings.following_error_mm()[self._span].tolist()
+        return result
+
+    def following_error_before_mm(self) -> list[float]:
+        result: list[float] = self._readings.following_error_before_mm()[self._span].tolist()
         return result
 
     def words(self) -> list[tuple[int, int, int]]:

@@ -19,6 +19,9 @@ from drivers.modbus_positioners import ModbusPositioners
 from sim.plc.group import PlcGroup
 from tests.support.modbus_cell import START_MM, StiffPlant, cell, plan
 
+SETTINGS = ("300", "500", "12", "25", "1500")
+"""watchdog_ms, ramp_ms, min_fill, stuck_um, servo_lag_us."""
+
 pytestmark = [pytest.mark.peer, pytest.mark.wires]
 
 
@@ -43,8 +46,8 @@ def _with_modbus_tk(port: int) -> dict[str, Any]:
     try:
         seen["identity"] = master.execute(3, defines.READ_HOLDING_REGISTERS, 0x200, 50)
         seen["input"] = master.execute(3, defines.READ_INPUT_REGISTERS, 0x200, 2)
-        seen["write"] = master.execute(3, defines.WRITE_MULTIPLE_REGISTERS, 0x40, output_value=[250, 600, 9])
-        seen["settings"] = master.execute(3, defines.READ_HOLDING_REGISTERS, 0x40, 3)
+        seen["write"] = master.execute(3, defines.WRITE_MULTIPLE_REGISTERS, 0x40, output_value=[250, 600, 9, 20, 2000])
+        seen["settings"] = master.execute(3, defines.READ_HOLDING_REGISTERS, 0x40, 5)
         seen["single"] = master.execute(3, defines.WRITE_SINGLE_REGISTER, 0x0F, output_value=77)
         seen["status"] = master.execute(3, defines.READ_HOLDING_REGISTERS, 0x100, 30)
         for key, unit, function, address in (
@@ -65,11 +68,11 @@ async def test_modbus_tk_reads_and_writes_the_simulated_plc() -> None:
     pytest.importorskip("modbus_tk")
     async with simulated_plcs() as (_, addresses):
         seen = await asyncio.to_thread(_with_modbus_tk, addresses["C"][1])
-    assert seen["identity"][:5] == (0x1234, 0x5678, 1, 3, 10)
+    assert seen["identity"][:5] == (0x1234, 0x5678, 2, 3, 10)
     assert struct.pack(">16H", *seen["identity"][6:22]).rstrip(b"\0") == b"C"
     assert seen["input"] == (0x1234, 0x5678)
-    assert seen["write"] == (0x40, 3)
-    assert seen["settings"] == (250, 600, 9)
+    assert seen["write"] == (0x40, 5)
+    assert seen["settings"] == (250, 600, 9, 20, 2000)
     assert seen["single"] == (0x0F, 77)
     assert seen["status"][1:4] == (77, 1, 0)
     positions = [struct.unpack(">i", struct.pack(">HH", *seen["status"][15 + 5 * i : 17 + 5 * i]))[0] for i in range(3)]
@@ -95,10 +98,14 @@ async def test_mbpoll_reads_int32_positions_high_word_first() -> None:
         port = addresses["B"][1]
         text = await _mbpoll(port, "-a", "2", "-r", str(0x10F + 5), "-c", "1", "-t", "4:int", "-B", "127.0.0.1")
         assert re.search(r"\[276\]:\s+-312346\b", text), text
-        written = await _mbpoll(port, "-a", "2", "-r", str(0x40), "-t", "4", "127.0.0.1", "300", "500", "12")
-        assert "Written 3 references" in written, written
-        text = await _mbpoll(port, "-a", "2", "-r", str(0x40), "-c", "3", "-t", "4", "127.0.0.1")
-        assert re.findall(r"\[\d+\]:\s+(\d+)", text) == ["300", "500", "12"]
+        written = await _mbpoll(port, "-a", "2", "-r", str(0x40), "-t", "4", "127.0.0.1", *SETTINGS)
+        assert "Written 5 references" in written, written
+        text = await _mbpoll(port, "-a", "2", "-r", str(0x40), "-c", "5", "-t", "4", "127.0.0.1")
+        assert re.findall(r"\[\d+\]:\s+(\d+)", text) == list(SETTINGS)
+        motion = await _mbpoll(port, "-a", "2", "-r", str(0x50), "-t", "4", "127.0.0.1", "40", "350")
+        assert "Written 2 references" in motion, motion
+        text = await _mbpoll(port, "-a", "2", "-r", str(0x50), "-t", "4", "127.0.0.1", "501", "350")
+        assert "Illegal data value" in text, "a quick ramp slower than the ordinary one"
         text = await _mbpoll(port, "-a", "2", "-r", "900", "-c", "1", "-t", "4", "127.0.0.1")
         assert "Illegal data address" in text
 
