@@ -22,18 +22,22 @@ class SettleSettings:
 
 
 async def settle(motion: Motion, settings: SettleSettings) -> float:
-    """Return the loop time at which the axes were at rest; raises NotSettled naming the axis that is not."""
+    """Return the loop time at which the axes were at rest; raises NotSettled naming the axis that is not.
+
+    Only a read-back that is newer than the one before says anything: the same one twice is no standstill.
+    """
     loop = asyncio.get_running_loop()
     end_s = loop.time() + settings.timeout_s
     pause_s = settings.window_s / settings.readings
     still, moved = 0, np.zeros(len(motion.axes))
-    before = motion.feedback().position_mm
+    before = motion.feedback()
     while still < settings.readings:
         await asyncio.sleep(pause_s)
-        now = motion.feedback().position_mm
-        moved = np.abs(now - before)
-        still = still + 1 if np.max(moved) <= settings.tolerance_mm else 0
-        before = now
+        now = motion.feedback()
+        if now.t_s > before.t_s:
+            moved = np.abs(now.position_mm - before.position_mm)
+            still = still + 1 if np.max(moved) <= settings.tolerance_mm else 0
+            before = now
         if loop.time() > end_s:
             axis = motion.axes[int(np.argmax(moved))]
             raise NotSettled(axis, value=float(np.max(moved)), limit=settings.tolerance_mm)
