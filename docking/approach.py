@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from docking.planning import Attempt, ConvergenceSettings, Verdict, attempt, correction_to, decide
+from docking.planning import Attempt, ConvergenceSettings, Scene, Verdict, attempt, correction_to, decide
 from docking.pose import Budget, Features, feature_errors, goal_pose
 from docking.types import Array, Correction, FeatureErrors, Fit
 
@@ -51,6 +51,13 @@ class Approach:
         then back along the docking axis by the stand-off."""
         goal = goal_pose(X_WC, X_WM, self.features, -station.standoff_mm * self._axis_W(X_WM))
         return correction_to(X_WC.X_MN, goal, self.face_C_mm)
+
+    def scene(self, X_WC: Fit, X_WM: Fit, station: Station) -> Scene:
+        """Where the parts are as a move to `station` is planned."""
+        i = self.stations.index(station)
+        before = self.stations[i - 1].standoff_mm if i > 0 else float("inf")
+        docked = goal_pose(X_WC, X_WM, self.features)
+        return Scene(X_WC.X_MN, X_WM.X_MN, docked, station.standoff_mm, before)
 
     def look(self, errors: FeatureErrors, station: Station, corrections: int, passes: int) -> Attempt:
         """What the features say at `station`. In contact the acceptance rule judges; before, it is enough that the

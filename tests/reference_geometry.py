@@ -8,14 +8,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from docking.kinematics import Load, Positioners
-from docking.planning import PlanSettings
+from docking.planning import JamSettings, PlanSettings
 
 NAMES = ("A", "B", "C", "D")
 AXES = tuple(f"{name}.{axis}" for name in NAMES for axis in "XYZ")
 BALLS = np.array([[-3000, -1800, -1200], [3000, -1800, -1200], [3000, 1800, -1200], [-3000, 1800, -1200]], dtype=float)
 FACE = np.array([4000.0, 0.0, 0.0])
 LOAD = Load(6000.0, 0.0, np.array([600.0, 200.0, 0.0]), np.zeros(3), np.array([0.0, 0.0, -9.80665]))
-SETTINGS = PlanSettings(load=LOAD)
+GUARDED = PlanSettings(load=LOAD)
+SETTINGS = replace(GUARDED, jam=JamSettings(residual_mm=1e9, force_n=1e12))
+"""The limits of the axes and the stage alone; GUARDED bounds what a jammed axis may do as well."""
 
 
 def rc1(axes_W: np.ndarray | None = None, driven: np.ndarray | None = None) -> Positioners:

@@ -8,7 +8,15 @@ from docking.config.budget import docked_pose
 from docking.config.cell import CellFile, ModbusBus
 from docking.config.job import JobFile
 from docking.kinematics import Load, Positioners, RankSettings
-from docking.planning import ConvergenceSettings, GuardSettings, PlanSettings
+from docking.planning import (
+    ConvergenceSettings,
+    GuardSettings,
+    JamSettings,
+    MateSettings,
+    PlanSettings,
+    outline_edges,
+)
+from docking.planning.relief import LoadCellErrors, ReliefSettings
 from docking.types import Array, readonly
 
 STANDARD_GRAVITY_M_S2 = 9.80665
@@ -110,7 +118,55 @@ def plan_settings(cell: CellFile, job: JobFile) -> PlanSettings:
         start_skew_s=bus.start_skew_s if isinstance(bus, ModbusBus) else 0.0,
         clock_ppm=bus.clock_ppm if isinstance(bus, ModbusBus) else 0.0,
         playback_ramp_s=bus.ramp_s if isinstance(bus, ModbusBus) else 0.0,
+        jam=jam_settings(cell),
+        mate=mate_settings(cell, job),
     )
+
+
+def jam_settings(cell: CellFile) -> JamSettings:
+    """How soon a jammed axis is met: two cycles of the bus, or two scans of the positioners, and the servos' lag."""
+    limits, bus = cell.limits, cell.bus
+    queued = isinstance(bus, ModbusBus)
+    twice_s = 2.0 * (bus.scan_s if isinstance(bus, ModbusBus) else bus.cycle_s)
+    return JamSettings(
+        stuck_mm=limits.stuck_mm,
+        reaction_s=twice_s + bus.servo_lag_s,
+        quick_floor_s=twice_s if queued else 0.0,
+        residual_mm=limits.ball_residual_mm,
+        force_n=limits.internal_force_n,
+    )
+
+
+def mate_settings(cell: CellFile, job: JobFile) -> MateSettings:
+    """Outline and envelope at their temperatures. Drives go straight on without a SYNC; queues are played on the path,
+    whoever falls silent."""
+    part, mate, limits = job.component, job.mate, cell.limits
+    grown = 1.0 + part.expansion_per_k * (part.temperature_c - cell.temperature_c)
+    mate_grown = 1.0 + mate.expansion_per_k * (mate.temperature_c - cell.temperature_c)
+    boxes = np.array([(box.min_mm, box.max_mm) for box in mate.envelope]).reshape(-1, 2, 3)
+    axis = np.array(job.docking_axis)
+    return MateSettings(
+        edges_C_mm=readonly(outline_edges(tuple(np.array(ring) for ring in part.outline_mm)) * grown),
+        boxes_M_mm=readonly(boxes * mate_grown),
+        face_C_mm=readonly(np.array(part.docking_face_mm) * grown),
+        axis_M=readonly(axis / np.linalg.norm(axis)),
+        clearance_mm=limits.clearance_mm,
+        contact_mm=limits.contact_mm,
+        corridor_mm=limits.corridor_mm,
+        corridor_length_mm=limits.corridor_length_mm,
+        coast_s=0.0 if isinstance(cell.bus, ModbusBus) else cell.bus.drive_timeout_s,
+    )
+
+
+def relief_settings(cell: CellFile) -> ReliefSettings:
+    """Limits of a stress relief. Without load cells their range is unknown, and so is every force."""
+    cells = cell.load_cells
+    if cells is None:
+        range_n = np.full(3 * len(cell.positioners), np.nan)
+        return ReliefSettings(LoadCellErrors(range_n), target_n=cell.limits.relief_target_n)
+    range_n = np.tile(np.array(cells.range_n), len(cell.positioners))
+    errors = LoadCellErrors(readonly(range_n), cells.crosstalk, cells.drift_per_h, cells.resolution_n)
+    return ReliefSettings(errors, target_n=cell.limits.relief_target_n)
 
 
 def plan_period_s(cell: CellFile) -> float:

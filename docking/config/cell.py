@@ -146,6 +146,14 @@ class PositionerConfig(Model):
     swivel_deg: Positive = Field(
         default=15.0, description="largest turn of the ball in its socket from the docked attitude, deg"
     )
+    back_drive_m_s2: NonNegative = Field(
+        default=0.5,
+        description="how a vertical axis accelerates downwards from torque off until its brake has closed; 0 where it "
+        "holds by itself, m/s^2",
+    )
+    brake_s: tuple[NonNegative, Positive] = Field(
+        default=(0.05, 0.1), description="shortest and longest time from torque off until a brake has closed, s"
+    )
     host: str | None = Field(default=None, description="Modbus TCP address")
     port: Annotated[int, Field(ge=1, le=65535)] | None = Field(default=None, description="Modbus TCP port")
     unit: Annotated[int, Field(ge=1, le=247)] | None = Field(default=None, description="Modbus unit id")
@@ -154,6 +162,11 @@ class PositionerConfig(Model):
 
 class LoadCellConfig(Model):
     range_n: tuple[Positive, Positive, Positive] = Field(description="along X, Y, Z, N")
+    crosstalk: Fraction = Field(
+        default=0.01, description="of the other two components of a ball, as a fraction of them, 1 sigma"
+    )
+    drift_per_h: Fraction = Field(default=0.001, description="of the zero, as a fraction of the range an hour, 1 sigma")
+    resolution_n: Positive = Field(default=10.0, description="one count of a reading, N")
 
 
 class SettleConfig(Model):
@@ -175,6 +188,14 @@ class LimitsConfig(Model):
         description="an axis that hangs back by more than its lag while its encoder makes less than half of the "
         "commanded step is stuck, mm",
     )
+    standstill_mm: Positive = Field(
+        default=0.02, description="stop when an axis that was told to stand moves farther than this, mm"
+    )
+    passive_mm: Positive = Field(
+        default=0.5,
+        description="stop when a passive axis is farther than this from where the component takes it, mm; the slack "
+        "of its friction is inside",
+    )
     sync_error_mm: Positive = Field(
         default=0.05,
         description="how far positioners on clocks of their own may squeeze the ball figure on the way; bounds the "
@@ -183,12 +204,52 @@ class LimitsConfig(Model):
     ball_residual_mm: Positive = Field(
         default=0.1, description="stop when the read-backs part from a rigid figure by more, mm"
     )
+    ball_rms_mm: Positive = Field(
+        default=0.06, description="the same for the root mean square over the balls, mm"
+    )
+    ball_pair_mm: Positive = Field(
+        default=0.15, description="stop when the distance of two balls changes by more, by the read-backs, mm"
+    )
     internal_force_n: Positive = Field(
         default=1500.0, description="stop above this internal force at a ball, predicted from the read-backs, N"
     )
     warp_force_n: Positive = Field(default=300.0, description="stop above this warp force of the vertical axes, N")
+    measured_force_n: Positive = Field(
+        default=1500.0,
+        description="stop when the load cells show more force at a ball, beyond what weight and attitude let expect, "
+        "than when the move was loaded, N",
+    )
+    measured_warp_n: Positive = Field(default=1000.0, description="the same for the warp of the vertical axes, N")
+    measured_whole_force_n: Positive = Field(
+        default=3000.0,
+        description="the same without a tare; wider, because load cells drift and cross-talk and mass and centre of "
+        "mass have tolerances, N",
+    )
+    measured_whole_warp_n: Positive = Field(default=2000.0, description="the same for the warp, N")
+    overload_fraction: Annotated[float, Field(gt=1.0, le=3.0)] = Field(
+        default=1.25, description="stop when a ball carries more than this times what it is expected to carry"
+    )
+    underload_fraction: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
+        default=0.5, description="stop when a ball carries less than this times what it is expected to carry"
+    )
+    relief_target_n: Positive = Field(
+        default=200.0, description="a stress relief ends when no ball carries more internal force, N"
+    )
     reaction_min_fraction: Fraction = Field(
         default=0.1, description="least upward ball reaction, as a fraction of the equal share of the weight"
+    )
+    clearance_mm: NonNegative = Field(
+        default=2.0,
+        description="kept between component.outline_mm and mate.envelope, or half the gap where that is less; mm",
+    )
+    contact_mm: NonNegative = Field(
+        default=0.3, description="taken off the clearance, so that the faces may meet at the end, mm"
+    )
+    corridor_mm: Positive = Field(
+        default=4.0, description="how far the part may be off its straight insertion near the mate, mm"
+    )
+    corridor_length_mm: NonNegative = Field(
+        default=100.0, description="up to this gap to the mate the part moves along its straight insertion only, mm"
     )
     stroke_margin_mm: NonNegative = Field(default=2.0, description="kept free at both stroke ends, mm")
     first_correction_mm: Positive = Field(default=50.0, description="largest shift of the first correction, mm")

@@ -43,6 +43,16 @@ class Feature(Model):
     )
 
 
+Ring = Annotated[tuple[Vector3, ...], Field(min_length=3)]
+
+
+class Box(Model):
+    """A box with faces along the axes of its frame."""
+
+    min_mm: Vector3 = Field(description="lower corner, mm")
+    max_mm: Vector3 = Field(description="upper corner, mm")
+
+
 class Component(Model):
     mass_kg: Positive = Field(description="kg")
     mass_tolerance_kg: NonNegative = Field(description="+-, kg")
@@ -52,6 +62,9 @@ class Component(Model):
     check_points: tuple[Target, ...] = Field(default=(), description="measured, never fitted")
     balls: tuple[Ball, ...] = Field(min_length=3, description="one for each positioner of the cell")
     features: tuple[Feature, ...] = Field(min_length=3, description="where component and mate must meet")
+    outline_mm: tuple[Ring, ...] = Field(
+        default=(), description="edges that could touch the mate: closed polylines in C, mm; none: not checked"
+    )
     docking_face_mm: Vector3 = Field(description="pivot of corrections in C: centre of the docking face, mm")
     expansion_per_k: NonNegative = Field(description="linear thermal expansion, 1/K")
     temperature_c: Finite = Field(default=20.0, description="of the component, deg C")
@@ -61,6 +74,9 @@ class Component(Model):
 class Mate(Model):
     pose: PoseVector = Field(description="approximate X_WM, mm and deg; refined from its targets")
     targets: tuple[Target, ...] = Field(min_length=4, description="measured and fitted")
+    envelope: tuple[Box, ...] = Field(
+        default=(), description="what the component must stay clear of on its way: boxes in M, mm; none: not checked"
+    )
     expansion_per_k: NonNegative = Field(description="linear thermal expansion, 1/K")
     temperature_c: Finite = Field(default=20.0, description="of the mate, deg C")
     temperature_sigma_k: NonNegative = Field(default=0.3, description="of that temperature, 1 sigma, K")

@@ -12,17 +12,22 @@ from docking.planning.correction import (
     decide,
     displaced,
 )
+from docking.planning.mate import Scene, moved_pose, outline_edges
 from docking.planning.plan import PlanRequest, make_plan
 from docking.planning.playback import position_at
-from docking.planning.settings import PlanSettings
+from docking.planning.retreat import retreat_plan
+from docking.planning.settings import JamSettings, MateSettings, PlanSettings
 
 __all__ = [
     "Action",
     "Attempt",
     "ConvergenceSettings",
     "GuardSettings",
+    "JamSettings",
+    "MateSettings",
     "PlanRequest",
     "PlanSettings",
+    "Scene",
     "Verdict",
     "attempt",
     "check_correction",
@@ -30,5 +35,8 @@ __all__ = [
     "decide",
     "displaced",
     "make_plan",
+    "moved_pose",
+    "outline_edges",
     "position_at",
+    "retreat_plan",
 ]

@@ -13,6 +13,7 @@ import numpy as np
 
 from docking.errors import AxisLimitExceeded
 from docking.kinematics import Positioners
+from docking.planning.jam import JamBound
 from docking.planning.path import RigidPath
 from docking.planning.settings import PlanSettings
 from docking.planning.time_law import TimeLaw, quintic, s_curve
@@ -64,6 +65,7 @@ class PaceLimits:
     period_s: float
     linear: bool
     settings: PlanSettings
+    jam: JamBound
 
     def stretches(self, path: RigidPath, law: TimeLaw) -> list[tuple[float, str]]:
         """(factor, limit) by which `law` must be stretched (shrunk below 1) to just meet each limit."""
@@ -71,6 +73,7 @@ class PaceLimits:
         axes, share = self.positioners, self.settings.acceleration_share
         skew = self._skew(motion, law)
         found = [(motion.point_speed / self.speed_mm_s, "stage speed"), (skew, "start skew of the bus")]
+        found += self.jam.stretches(motion.speed.max(axis=0))
         ratios = {"speed": motion.speed.max(axis=0) / axes.v_mm_s}
         if self.settings.playback_ramp_s > 0.0:
             ratios["stopping"] = self._stopping(motion)
@@ -99,7 +102,8 @@ class PaceLimits:
         drift = motion.point_speed * law.duration_s * 2e-6 * self.settings.clock_ppm
         left = self.settings.sync_error_mm - drift
         if not left > 0.0:
-            cause = "Clock drift over the move in mm; divide the move or raise the clocks' quality."
+            parts = ceil(drift / self.settings.sync_error_mm * 1.25)
+            cause = f"Clock drift over the move in mm; {parts} moves with a stop between them would fit."
             raise AxisLimitExceeded("bus", cause, value=drift, limit=self.settings.sync_error_mm)
         return motion.point_speed * self.settings.start_skew_s / left
 
@@ -133,12 +137,13 @@ def _s_curves_for(path: RigidPath, limits: PaceLimits) -> Iterator[TimeLaw]:
     g, h = (np.maximum(path.axis_bounds(order), 1e-12) for order in (1, 2))
     point_speed = float(path.point_speed_mm(np.linspace(0.0, 1.0, 17)).max())
     j = float(np.min(axes.j_mm_s3 / g))
+    unjammed = 1.0 / max(factor for factor, _ in limits.jam.stretches(g))
     for part in (1.0,) if ramp_s == 0.0 else _DIVISIONS:
         usable = part * limits.settings.acceleration_share * axes.a_mm_s2
         bounds = [axes.v_mm_s / g, np.sqrt(0.25 * usable / h)]
         if ramp_s > 0.0:
             bounds.append(ramp_s * (axes.a_mm_s2 - usable) / g)
-        v = min(limits.speed_mm_s / point_speed, *(float(np.min(bound)) for bound in bounds))
+        v = min(unjammed, limits.speed_mm_s / point_speed, *(float(np.min(bound)) for bound in bounds))
         yield s_curve(v, float(np.min((usable - h * v**2) / g)), j)
 
 

@@ -85,13 +85,45 @@ class RigidPath:
         return float(np.max(np.linalg.norm(across[:, None, :] - across[None, :, :], axis=2)))
 
 
+@dataclass(frozen=True, eq=False)
+class CarriedPoints:
+    """Points of the component along the same motion: `start_mm` (..., 3) in W and their `rows` (3, ..., 3)."""
+
+    start_mm: Array
+    rows: Array
+    angle_rad: float
+
+    def at(self, s: Array) -> Array:
+        """Places (n, ..., 3) at `s` (n,)."""
+        result: Array = self.start_mm + np.tensordot(_basis(s, self.angle_rad, 0), self.rows, 1)
+        return result
+
+    def rate(self, s: Array) -> Array:
+        """d place / ds (n, ..., 3)."""
+        result: Array = np.tensordot(_basis(s, self.angle_rad, 1), self.rows, 1)
+        return result
+
+
+def carried_points(correction: Correction, points_W_mm: Array) -> CarriedPoints:
+    """How `points_W_mm` (..., 3) of the component go through `correction`."""
+    rows, angle, _ = _motion_rows(correction, points_W_mm - correction.pivot_W_mm)
+    return CarriedPoints(points_W_mm, rows, angle)
+
+
+def _motion_rows(correction: Correction, arms_mm: Array) -> tuple[Array, float, Array]:
+    """Weights (3, ..., 3) of [s, cos - 1, sin] for points at `arms_mm` (..., 3) from the pivot; angle; unit axis."""
+    angle = float(np.linalg.norm(correction.rotvec_rad))
+    unit = correction.rotvec_rad / angle if angle > 0.0 else np.zeros(3)
+    along = np.einsum("...i,i->...", arms_mm, unit)
+    across = arms_mm - along[..., None] * unit if angle > 0.0 else np.zeros_like(arms_mm)
+    shift = np.broadcast_to(correction.shift_mm, arms_mm.shape)
+    return np.stack([shift, across, np.cross(unit, arms_mm)]), angle, unit
+
+
 def rigid_path(positioners: Positioners, q_now_mm: Array, correction: Correction) -> RigidPath:
     """The path that carries the socket figure commanded at `q_now_mm` (m,) through `correction`, keeping it rigid."""
     arms = socket_positions(positioners, q_now_mm) - correction.pivot_W_mm
-    angle = float(np.linalg.norm(correction.rotvec_rad))
-    unit = correction.rotvec_rad / angle if angle > 0.0 else np.zeros(3)
-    across = arms - np.outer(arms @ unit, unit) if angle > 0.0 else np.zeros_like(arms)
-    moved = np.stack([np.broadcast_to(correction.shift_mm, arms.shape), across, np.cross(unit, arms)])
+    moved, angle, unit = _motion_rows(correction, arms)
     pivot = np.stack([correction.shift_mm, np.zeros(3), np.zeros(3)])[:, None, :]
     points = np.concatenate([moved, pivot], axis=1).reshape(3, -1)
     return RigidPath(np.array(q_now_mm), axis_displacements(positioners, moved), points, angle, unit, arms)

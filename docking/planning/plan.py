@@ -9,18 +9,24 @@ import numpy as np
 
 from docking.errors import PlanInputInvalid
 from docking.kinematics import Positioners, pose_from_axes
+from docking.planning.attitudes import check_attitudes
+from docking.planning.jam import jam_bound
+from docking.planning.mate import Clearance, Scene, check_mate
 from docking.planning.pace import PaceLimits, fastest_law, rate_slew_per_s
-from docking.planning.path import rigid_path
-from docking.planning.preflight import check_attitudes, check_chord, check_strokes, check_table
+from docking.planning.path import RigidPath, rigid_path
+from docking.planning.preflight import check_chord, check_strokes, check_table
 from docking.planning.settings import PlanSettings
-from docking.types import Array, Correction, Plan
+from docking.planning.strain import foreseen_strain
+from docking.planning.time_law import TimeLaw
+from docking.types import Array, Correction, Plan, PlanBounds
 
 
 @dataclass(frozen=True, eq=False)
 class PlanRequest:
     """One move to plan: `q_now_mm` (m,) commanded axis positions (read-back for passive axes), `correction` in W,
     `speed_mm_s` of the fastest ball or the pivot, `period_s` between two rows (bus cycle or segment);
-    `linear_interpolation`: the devices interpolate each axis linearly between rows, so the chord error binds."""
+    `linear_interpolation`: the devices interpolate each axis linearly between rows, so the chord error binds; `scene`:
+    where component and mate are, None where nothing is near (what the mate asks is not checked then)."""
 
     plan_id: int
     stage: str
@@ -30,16 +36,19 @@ class PlanRequest:
     speed_mm_s: float
     period_s: float
     linear_interpolation: bool
+    scene: Scene | None = None
 
 
 def make_plan(request: PlanRequest, positioners: Positioners, settings: PlanSettings) -> Plan:
     """Plan and check the whole move. Raises PlanInputInvalid, StrokeExceeded, AxisLimitExceeded, BallReactionOut,
-    BallSwivelExceeded; FrameImplausible when the axis positions fit no pose."""
+    BallSwivelExceeded, StrainForeseen, ApproachRefused, MateTooNear; FrameImplausible when the axis positions fit no
+    pose."""
     _check_request(request, positioners)
     path = rigid_path(positioners, request.q_now_mm, request.correction)
     room = check_strokes(path, positioners, settings)
     check_attitudes(pose_from_axes(positioners, request.q_now_mm), request.correction, positioners, settings)
-    limits = PaceLimits(positioners, request.speed_mm_s, request.period_s, request.linear_interpolation, settings)
+    jam = jam_bound(positioners, request.q_now_mm, settings.jam)
+    limits = PaceLimits(positioners, request.speed_mm_s, request.period_s, request.linear_interpolation, settings, jam)
     law, limited_by = fastest_law(path, limits)
     t_s = request.period_s * np.arange(round(law.duration_s / request.period_s) + 1, dtype=np.float64)
     s = law.at(t_s)
@@ -64,6 +73,35 @@ def make_plan(request: PlanRequest, positioners: Positioners, settings: PlanSett
         rate_slew_per_s=rate_slew_per_s(path, law, limits),
         speed_limited_by=limited_by,
         margins=margins,
+        bounds=_bounds(request, path, law, limits, s, peak),
+    )
+
+
+def _bounds(
+    request: PlanRequest, path: RigidPath, law: TimeLaw, limits: PaceLimits, s: Array, peak_mm_s: Array
+) -> PlanBounds:
+    """What is foreseen of the timed move; raises what that forbids."""
+    jam, settings = limits.jam, limits.settings
+    quick_stop_s = jam.quick_stop_s(peak_mm_s)
+    clear = Clearance()
+    if request.scene is not None:
+        clear = check_mate(request.scene, request.correction, law, settings.mate, quick_stop_s)
+    strain = foreseen_strain(path, s, limits.positioners, settings, law.duration_s)
+    used = sorted(((name, factor) for factor, name in limits.stretches(path, law)), key=lambda item: -item[1])
+    return PlanBounds(
+        peak_mm_s=peak_mm_s,
+        quick_stop_s=quick_stop_s,
+        jam_mm=jam.jam_mm(peak_mm_s),
+        jam_n=jam.jam_n(peak_mm_s),
+        ramp_mm=jam.ramp_mm(peak_mm_s),
+        residual_mm=strain.residual_mm,
+        force_n=strain.force_n,
+        warp_n=strain.warp_n,
+        clearance_mm=clear.distance_mm,
+        clearance_asked_mm=clear.asked_mm,
+        clearance_s=clear.s,
+        duration_s=law.duration_s,
+        limits=tuple(used),
     )
 
 

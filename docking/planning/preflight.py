@@ -5,19 +5,17 @@ Domain 5.3, 5.8; faults 4.3. Each refusal names the axis, where on the path (s),
 
 from __future__ import annotations
 
-from math import ceil, degrees, sqrt
+from math import ceil, sqrt
 
 import numpy as np
 
-from docking.errors import AxisLimitExceeded, BallReactionOut, BallSwivelExceeded, StrokeExceeded
-from docking.geometry import exp_so3, rotation_angle
-from docking.kinematics import Positioners, reaction_extremes
+from docking.errors import AxisLimitExceeded, StrokeExceeded
+from docking.kinematics import Positioners
 from docking.planning.path import RigidPath
 from docking.planning.settings import PlanSettings
-from docking.types import Array, Correction, Pose
+from docking.types import Array
 
 _ROUNDING = 1e-6
-_POSE_SAMPLES = 5
 
 
 def check_strokes(path: RigidPath, positioners: Positioners, settings: PlanSettings) -> Array:
@@ -45,43 +43,9 @@ def _refuse_stroke(positioners: Positioners, settings: PlanSettings, k: int, s: 
     worst = int(np.argmax(np.where(np.isnan(over), np.inf, over)))
     first = int(np.argmax(~(over <= _ROUNDING)))
     value = float(q_mm[worst])
-    cause = f"First outside at s = {s[first]:.3f}, worst at s = {s[worst]:.3f}."
+    fits = f"{100.0 * s[first - 1]:.0f} % of the move fit" if first > 0 else "the start is outside already"
+    cause = f"First outside at s = {s[first]:.3f}, worst at s = {s[worst]:.3f}; {fits}."
     raise StrokeExceeded(positioners.axes[k], cause, value=value, limit=float(low if value < low else high))
-
-
-def check_attitudes(X_WC: Pose, correction: Correction, positioners: Positioners, settings: PlanSettings) -> None:
-    """Ball swivel and ball reactions along the path from X_WC; centre of mass +- its tolerance.
-
-    Raises BallSwivelExceeded, or BallReactionOut under the least share of the weight or over an axis's rating.
-    """
-    for s in np.linspace(0.0, 1.0, _POSE_SAMPLES):
-        turn = exp_so3(s * correction.rotvec_rad)
-        moved = correction.pivot_W_mm + s * correction.shift_mm + turn @ (X_WC.t_mm - correction.pivot_W_mm)
-        X = Pose(turn @ X_WC.R, moved)
-        _check_swivel(X, float(s), positioners)
-        _check_reactions(X, float(s), positioners, settings)
-
-
-def _check_swivel(X_WC: Pose, s: float, positioners: Positioners) -> None:
-    angle = rotation_angle(positioners.neutral_R_WC.T @ X_WC.R)
-    tightest = int(np.argmin(positioners.swivel_rad))
-    if not angle <= positioners.swivel_rad[tightest]:
-        limit = degrees(float(positioners.swivel_rad[tightest]))
-        raise BallSwivelExceeded(positioners.names[tightest], f"At s = {s:.3f}.", value=degrees(angle), limit=limit)
-
-
-def _check_reactions(X_WC: Pose, s: float, positioners: Positioners, settings: PlanSettings) -> None:
-    found = reaction_extremes(positioners, X_WC, settings.load)
-    i = int(np.argmin(found.least_share))
-    if not found.least_share[i] >= settings.reaction_min_fraction:
-        limit = settings.reaction_min_fraction * found.least_up_n[i] / found.least_share[i]
-        cause = f"Least upward force over the tolerance of the centre of mass, at s = {s:.3f}."
-        raise BallReactionOut(positioners.names[i], cause, value=float(found.least_up_n[i]), limit=float(limit))
-    use = found.peak_axis_n / positioners.rated_n.reshape(-1)
-    k = int(np.argmax(use))
-    if not use[k] <= 1.0:
-        peak, rated = float(found.peak_axis_n[k]), float(positioners.rated_n.reshape(-1)[k])
-        raise BallReactionOut(positioners.axes[k], f"Over the rating at s = {s:.3f}.", value=peak, limit=rated)
 
 
 def check_table(s: Array, q_mm: Array, period_s: float, positioners: Positioners) -> Array:
@@ -105,7 +69,8 @@ def check_table(s: Array, q_mm: Array, period_s: float, positioners: Positioners
         k = int(np.argmax(np.where(np.isnan(peak), np.inf, peak / limit)))
         if not peak[k] <= limit[k] * (1.0 + _ROUNDING):
             row = min(max(int(np.argmax(np.abs(rows[k]))) - 2, 0), len(s) - 1)
-            cause = f"{what} of the set-points near s = {s[row]:.3f}."
+            fits = 100.0 * float((limit[k] / peak[k]) ** (1.0 / (order + 1))) if peak[k] > 0.0 else 0.0
+            cause = f"{what} of the set-points near s = {s[row]:.3f}; {fits:.0f} % of the speed would fit."
             raise AxisLimitExceeded(positioners.axes[k], cause, value=float(peak[k]), limit=float(limit[k]))
     return peak_speed
 

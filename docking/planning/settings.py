@@ -2,9 +2,51 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
 
 from docking.kinematics import Load
+from docking.types import Array
+
+
+@dataclass(frozen=True)
+class JamSettings:
+    """How soon a jammed axis is met, and what it may cost.
+
+    It is seen when it hangs back by `stuck_mm` more than its lag; the others go on for `reaction_s` and then ramp down
+    with the axes' a_quick, in `quick_floor_s` at least. `residual_mm` at the worst ball and `force_n` are the limits.
+    """
+
+    stuck_mm: float = 0.02
+    reaction_s: float = 0.022
+    quick_floor_s: float = 0.0
+    residual_mm: float = 0.1
+    force_n: float = 1500.0
+
+
+@dataclass(frozen=True, eq=False)
+class MateSettings:
+    """What must stay clear of what: the component's edges in C, the mate's envelope in M, and by how much.
+
+    `edges_C_mm` (e, 2, 3) straight pieces of the outline; `boxes_M_mm` (b, 2, 3) lower and upper corners; `face_C_mm`
+    (3,) centre of the docking face; `axis_M` (3,) unit vector of the insertion. Clearance asked at a gap g to the mate:
+    min(clearance_mm, g / 2) - contact_mm. At gaps up to `corridor_length_mm` the part stays within `corridor_mm` of the
+    straight insertion. `coast_s`: drives that miss their SYNC go straight on for so long before they stop.
+    """
+
+    edges_C_mm: Array
+    boxes_M_mm: Array
+    face_C_mm: Array
+    axis_M: Array
+    clearance_mm: float = 2.0
+    contact_mm: float = 0.3
+    corridor_mm: float = 4.0
+    corridor_length_mm: float = 100.0
+    coast_s: float = 0.0
+
+
+NO_MATE = MateSettings(np.zeros((0, 2, 3)), np.zeros((0, 2, 3)), np.zeros(3), np.array([1.0, 0.0, 0.0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,3 +70,5 @@ class PlanSettings:
     acceleration_share: float = 0.5
     rate_slew_max_per_s: float = 10.0
     sample_mm: float = 0.05
+    jam: JamSettings = JamSettings()
+    mate: MateSettings = field(default_factory=lambda: NO_MATE)
