@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from docking.types import Array
+from sim.canopen.dictionary import MM_PER_REVOLUTION, NEWTON_PER_PER_MILLE
 from sim.canopen.drives import Drives
 from sim.canopen.plant_axes import NEWTON_PER_COUNT, PlantAxes
 
@@ -65,5 +66,11 @@ class ObjectAccess:
             self._drives.parameters.window_s[index] = value * 1e-3
         elif obj == 0x6040:
             self._drives.control(index, value, self._now_s())
+        elif obj == 0x6071:
+            self._drives.forces.aim(index, value * NEWTON_PER_PER_MILLE)
+        elif obj == 0x6072:
+            self._drives.parameters.max_force_n[index] = value * NEWTON_PER_PER_MILLE
+        elif obj == 0x6080:
+            self._drives.parameters.max_speed_mm_s[index] = value * MM_PER_REVOLUTION / 60.0
         elif obj == 0x607A:
             self._drives.latch(np.array([index]), np.array([value / self._counts_per_mm]))

@@ -11,9 +11,10 @@ from sim.canopen.settings import DriveSettings
 
 INVALID: Final = 0x8000_0000
 CYCLIC_RPDO: Final = (0x6040_0010, 0x607A_0020, 0x6060_0008)
+FORCE_RPDO: Final = (0x6040_0010, 0x6071_0010, 0x6060_0008)
 CYCLIC_TPDO: Final = (0x6041_0010, 0x6064_0020, 0x60F4_0010)
 FORCE_TPDO: Final = (0x2100_0110,)
-_LAYOUTS: Final = {0x1600: CYCLIC_RPDO, 0x1A00: CYCLIC_TPDO, 0x1A01: FORCE_TPDO}
+_LAYOUTS: Final = {0x1600: (CYCLIC_RPDO, FORCE_RPDO), 0x1A00: (CYCLIC_TPDO,), 0x1A01: (FORCE_TPDO,)}
 _FACTORY: Final = {
     0x1400: (0x200, (0x6040_0010,)),
     0x1401: (0x300, (0x6040_0010, 0x6060_0008)),
@@ -37,6 +38,11 @@ _SPANS: Final = {
     "I": (0, 0xFFFF_FFFF),
     "i": (-0x8000_0000, 0x7FFF_FFFF),
 }
+
+RATED_TORQUE_MNM: Final = 32_000
+NEWTON_PER_PER_MILLE: Final = 20.0
+"""Force at the ball of one thousandth of the rated torque, through gear and screw: 20 kN at 32 Nm."""
+MM_PER_REVOLUTION: Final = 10.0
 
 READ_ONLY: Final = 0x0601_0002
 NO_OBJECT: Final = 0x0602_0000
@@ -125,14 +131,14 @@ class Dictionary:
         self._entries[index, sub] = replace(entry, value=value)
         self._changed(index, sub, value)
 
-    def mapped(self, communication: int) -> bool:
-        """True while the PDO is valid and carries the cyclic layout."""
+    def mapped(self, communication: int, layout: tuple[int, ...]) -> bool:
+        """True while the PDO is valid and carries this layout."""
         mapping = communication + 0x200
         count = self.number(mapping, 0)
         words = tuple(self.number(mapping, sub) for sub in range(1, count + 1))
         low, high = _TRANSMISSION[communication]
         timely = low <= self.number(communication, 2) <= high
-        return timely and not self.number(communication, 1) & INVALID and words == _LAYOUTS.get(mapping)
+        return timely and not self.number(communication, 1) & INVALID and words == layout
 
     def _find(self, index: int, sub: int) -> Entry:
         entry = self._entries.get((index, sub))
@@ -159,7 +165,7 @@ class Dictionary:
             raise Abort(WRONG_STATE)
         if sub == 0 and value:
             words = tuple(self.number(index, number) for number in range(1, value + 1))
-            if words not in (_LAYOUTS.get(index), _FACTORY[index - 0x200][1]):
+            if words not in (*_LAYOUTS.get(index, ()), _FACTORY[index - 0x200][1]):
                 raise Abort(NOT_MAPPABLE)
 
 
@@ -194,22 +200,27 @@ def _drive() -> dict[tuple[int, int], Entry]:
         (0x6040, 0): Entry("H", 0, True),
         (0x6041, 0): Entry("H", 0),
         (0x605A, 0): Entry("h", 2, True, 0, 8),
+        (0x605D, 0): Entry("h", 1, True, 1, 4),
         (0x605E, 0): Entry("h", 2, True, 0, 4),
         (0x6060, 0): Entry("b", 0, True),
         (0x6061, 0): Entry("b", 0),
         (0x6064, 0): Entry("i", 0),
         (0x6065, 0): Entry("I", 0xFFFF_FFFF, True),
         (0x6066, 0): Entry("H", 0, True),
+        (0x6071, 0): Entry("h", 0, True),
+        (0x6072, 0): Entry("H", 1000, True),
+        (0x6076, 0): Entry("I", RATED_TORQUE_MNM),
         (0x607A, 0): Entry("i", 0, True),
         (0x607D, 0): Entry("B", 2),
         (0x607D, 1): Entry("i", -0x8000_0000, True),
         (0x607D, 2): Entry("i", 0x7FFF_FFFF, True),
+        (0x6080, 0): Entry("I", 6000, True),
         (0x6085, 0): Entry("I", 1_000_000, True, 1),
         (0x60C2, 0): Entry("B", 2),
         (0x60C2, 1): Entry("B", 20, True, 1),
         (0x60C2, 2): Entry("b", -3, True, -6, 0),
         (0x60F4, 0): Entry("i", 0),
-        (0x6502, 0): Entry("I", 1 << 7),
+        (0x6502, 0): Entry("I", 1 << 7 | 1 << 9),
     }
 
 

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from docking.types import Array
+from sim.canopen.parameters import BoolArray, ForceTargets, Parameters
 from sim.canopen.settings import DriveSettings
 
-BoolArray = NDArray[np.bool_]
-
 CSP: Final = 8
+CST: Final = 10
 FOLLOWING_ERROR: Final = 0x8611
 HOST_LOST: Final = 0x8130
 SYNC_LOST: Final = 0x8700
@@ -43,19 +43,6 @@ _POWERED = (Stage.OPERATION, Stage.QUICK_STOP, Stage.FAULT_REACTION)
 _RAMPING = (Stage.QUICK_STOP, Stage.FAULT_REACTION)
 
 
-class Parameters:
-    """What the drives were told by SDO, as arrays (m,) in mm, s."""
-
-    def __init__(self, count: int) -> None:
-        self.low_mm: Array = np.full(count, -np.inf)
-        self.high_mm: Array = np.full(count, np.inf)
-        self.window_mm: Array = np.full(count, np.inf)
-        self.window_s: Array = np.zeros(count)
-        self.decel_mm_s2: Array = np.full(count, 100.0)
-        self.quick_stop_option: list[int] = [2] * count
-        self.fault_option: list[int] = [2] * count
-
-
 class Drives:
     """m power stages. `emergency(index, code)` is called when one trips."""
 
@@ -71,6 +58,7 @@ class Drives:
         self.powered: BoolArray = np.zeros(count, np.bool_)
         self.braked: BoolArray = np.ones(count, np.bool_)
         self.following: BoolArray = np.zeros(count, np.bool_)
+        self.forces = ForceTargets(count, self.parameters)
         self.statuswords: NDArray[np.uint16] = np.zeros(count, np.uint16)
         self.error_codes: list[int] = [0] * count
         self.busy = False
@@ -80,6 +68,7 @@ class Drives:
         self._goal: Array = start_mm.copy()
         self._now: Array = start_mm.copy()
         self._speed: Array = np.zeros(count)
+        self._standing_mm: Callable[[], Array] = lambda: self._now
         self._limited: BoolArray = np.zeros(count, np.bool_)
         self._switched: BoolArray = np.zeros(count, np.bool_)
         self._seized_brakes: dict[int, bool] = {}
@@ -96,6 +85,9 @@ class Drives:
         A drive reaches its target one cycle after the SYNC that brought it, in a straight line. `standing_mm()` gives
         the encoder positions, asked only while something special happens.
         """
+        self._standing_mm = standing_mm
+        if self.forces.pressing.any():
+            self.forces.note(standing_mm(), elapsed_s)
         if elapsed_s >= 0.75 * self.cycle_s:
             self._now = self._goal
         else:
@@ -169,6 +161,17 @@ class Drives:
         if self.stages[index] is Stage.OPERATION:
             self._begin_ramp(index, Stage.QUICK_STOP, t_s)
 
+    def lose_sync(self, t_s: float) -> None:
+        """No SYNC comes any more: do what the settings say."""
+        for index, stage in enumerate(self.stages):
+            if stage is not Stage.OPERATION:
+                continue
+            if self._settings.sync_loss == "fault":
+                self.trip(index, SYNC_LOST, t_s)
+            elif self._settings.sync_loss == "quick-stop":
+                self._emergency(index, SYNC_LOST)
+                self.quick_stop(index, t_s)
+
     def trip(self, index: int, code: int, t_s: float, torque_lost: bool = False) -> None:
         """A drive fault: emergency, ramp down where the drive still can, brake, FAULT."""
         if self.stages[index] in (Stage.FAULT, Stage.FAULT_REACTION):
@@ -201,7 +204,8 @@ class Drives:
     def _begin_ramp(self, index: int, stage: Stage, t_s: float) -> None:
         if self.stages[index] is Stage.OPERATION:
             speed = (self._goal[index] - self._start[index]) / self.cycle_s
-            self._speed[index] = speed if self.following[index] else 0.0
+            own = float(self.forces.speed_mm_s[index]) if self.forces.pressing[index] else 0.0
+            self._speed[index] = speed if self.following[index] else own
         self._enter(index, stage, t_s)
 
     def _enter(self, index: int, stage: Stage, t_s: float, *, hold: bool = False) -> None:
@@ -221,6 +225,10 @@ class Drives:
             if not closing and (not self.braked[index] or index in self._brake_due):
                 self._brake(index, True, t_s)
         if stage is not Stage.OPERATION:
+            if self.forces.release(index):
+                # An axis that pressed holds the position that the component has taken it to.
+                self._now = self._now.copy()
+                self._now[index] = self._standing_mm()[index]
             self.following[index] = False
             self._goal = self._goal.copy()
             self._goal[index] = self._now[index]
@@ -243,7 +251,7 @@ class Drives:
             if stage in _RAMPING:
                 now[index] = self._ramp(index, dt_s, float(now[index]))
                 self._finish_ramp(index, t_s)
-            elif stage is Stage.OPERATION and not self.following[index]:
+            elif stage is Stage.OPERATION and not self._leads(index):
                 now[index] = standing_mm[index]
                 self._begin_following(index)
             elif stage is not Stage.OPERATION:
@@ -259,14 +267,22 @@ class Drives:
     def _pending(self, index: int) -> bool:
         stage = self.stages[index]
         if stage is Stage.OPERATION:
-            return not self.following[index]
+            return not self._leads(index)
         # An axis without torque may be driven back or float: its set-point goes with it.
         return stage in _RAMPING and not (stage is Stage.QUICK_STOP and self._speed[index] == 0.0)
 
+    def _leads(self, index: int) -> bool:
+        """True while an axis obeys its set-points or its target force."""
+        return bool(self.following[index] or self.forces.pressing[index])
+
     def _begin_following(self, index: int) -> None:
-        if not self.braked[index] and index not in self._brake_due and self.modes[index] == CSP:
+        if self.braked[index] or index in self._brake_due:
+            return
+        if self.modes[index] == CSP:
             self.following[index] = True
-            self._report(index)
+        elif self.modes[index] == CST:
+            self.forces.take(index)
+        self._report(index)
 
     def _ramp(self, index: int, dt_s: float, now_mm: float) -> float:
         """Exact distance of a uniform deceleration over one step."""
@@ -294,7 +310,7 @@ class Drives:
     def _report(self, index: int) -> None:
         """Compose the statusword."""
         word = int(self.stages[index]) | _REMOTE_AND_VOLTAGE
-        word |= _FOLLOWS if self.following[index] else 0
+        word |= _FOLLOWS if self._leads(index) else 0
         word |= _LIMIT if self._limited[index] or self._switched[index] else 0
         word |= _BRAKE if self.braked[index] else 0
         word |= _WINDOW if self.error_codes[index] == FOLLOWING_ERROR else 0

@@ -13,8 +13,8 @@ from docking.config.cell import CanBus, CellFile
 from docking.errors import ConfigInvalid
 from docking.types import Array
 from sim.canopen.access import ObjectAccess
-from sim.canopen.dictionary import INVALID
-from sim.canopen.drives import HOST_LOST, SYNC_LOST, Drives, Stage
+from sim.canopen.dictionary import INVALID, NEWTON_PER_PER_MILLE
+from sim.canopen.drives import HOST_LOST, Drives
 from sim.canopen.faults import DriveFaults
 from sim.canopen.faulty_wire import FaultyWire
 from sim.canopen.heartbeats import Heartbeats
@@ -25,6 +25,7 @@ from sim.wires.can_frames import CanEnd, CanFrame
 
 _SYNC = 0x80
 _RPDO: Final = np.dtype([("controlword", "<u2"), ("target", "<i4"), ("mode", "i1")])
+_FORCE_RPDO: Final = np.dtype([("controlword", "<u2"), ("target", "<i2"), ("mode", "i1")])
 _TPDO: Final = np.dtype([("statusword", "<u2"), ("position", "<i4"), ("error", "<i2")])
 _LONG_S: Final = 0.05
 _SHORTEST_CYCLES: Final = 0.9
@@ -68,7 +69,7 @@ class DriveGroup:
         self._table_encoder: Array | None = None
         self._error: Array = self._plant.following_error_mm()
         self._cached: list[CanFrame] | None = None
-        self._pending: dict[int, bytes] = {}
+        self._pending, self._pending_forces = dict[int, bytes](), dict[int, bytes]()
         self._last_batch: list[CanFrame] | None = None
         self._last_joined = self._batch_joined = b""
         self._last_words = self._last_modes = b""
@@ -127,10 +128,9 @@ class DriveGroup:
         cobs = self._fast_cobs
         if self._settings.shared_cpu and len(batch) > len(cobs):
             self._waiting = max(0, [frame[0] for frame in batch].count(_SYNC) - 1)
-        head = batch[: len(cobs)]
-        if [frame[0] for frame in head] == cobs:
-            joined = b"".join([frame[1] for frame in head])
-            if len(joined) == len(self._fast_rows) * _RPDO.itemsize:
+        if [frame[0] for frame in batch[: len(cobs)]] == cobs:
+            joined = b"".join([frame[1] for frame in batch[: len(cobs)]])
+            if len(joined) == len(self._fast_rows) * _RPDO.itemsize + len(self._force_rows) * _FORCE_RPDO.itemsize:
                 self._last_batch, self._batch_joined = batch if len(batch) == len(cobs) else None, joined
                 self._sync(joined)
                 batch = batch[len(cobs) :]
@@ -155,6 +155,8 @@ class DriveGroup:
                 self._transmit([(0x580 + node.number, answer)])
         elif node.takes_set_points and len(data) == _RPDO.itemsize:
             self._pending[node.index] = data
+        elif node.takes_forces and len(data) == _FORCE_RPDO.itemsize:
+            self._pending_forces[node.index] = data
 
     def _network_management(self, data: bytes) -> None:
         if len(data) != 2:
@@ -187,7 +189,9 @@ class DriveGroup:
         for node in self.nodes:
             node.refresh_host()
         takers = [node for node in able if node.takes_set_points]
-        self._fast_cobs = [0x200 + node.number for node in takers] + [_SYNC]
+        pressers = [node for node in able if node.takes_forces]
+        self._fast_cobs = [*(0x200 + node.number for node in takers + pressers), _SYNC]
+        self._force_rows = [node.index for node in pressers]
         self._fast_rows: NDArray[np.intp] = np.array([node.index for node in takers], dtype=np.intp)
         self._reporting = [(0x180 + node.number, node.index) for node in able if node.reports]
         weighing = [node for node in able if node.reports_force]
@@ -206,7 +210,7 @@ class DriveGroup:
             self._relatch = True
         if joined is not None:
             self._latch_all(joined, now_s)
-        elif self._pending:
+        elif self._pending or self._pending_forces:
             self._latch_each(now_s)
         else:
             self.drives.stay()
@@ -229,11 +233,17 @@ class DriveGroup:
         plant, drives = self._plant, self.drives
         elapsed_s = now_s - self._step_s
         set_point = drives.advance(now_s, elapsed_s, plant.encoder_mm)
+        self._press()
         plant.step(now_s, set_point, drives.powered, drives.braked)
         if not plant.at_rest():
             self._error = plant.following_error_mm()
             drives.monitor(now_s, self._error)
             self._cached = None
+
+    def _press(self) -> None:
+        """Pass on what the axes exert that hold a force."""
+        if self.drives.forces.changed:
+            self._plant.press(self.drives.forces.exerted_n(), self.drives.parameters.max_speed_mm_s)
 
     def _report(self) -> None:
         """Send the read-backs; the same bytes again while nothing moves."""
@@ -271,26 +281,43 @@ class DriveGroup:
         if joined == self._last_joined and not self._relatch:
             self.drives.stay()
             return
-        image = np.frombuffer(joined, _RPDO)
+        count = len(self._fast_rows)
+        image = np.frombuffer(joined, _RPDO, count)
+        if self._force_rows:
+            forces = np.frombuffer(joined, _FORCE_RPDO, offset=count * _RPDO.itemsize)
+            self._latch_forces(self._force_rows, forces, now_s)
         words, modes = image["controlword"].tobytes(), image["mode"].tobytes()
         if words != self._last_words or modes != self._last_modes or self._relatch:
-            for index, word, mode in zip(
-                self._fast_rows.tolist(), image["controlword"].tolist(), image["mode"].tolist(), strict=True
-            ):
-                self.drives.modes[index] = mode
-                self.drives.control(index, word, now_s)
+            self._obey(self._fast_rows.tolist(), image, now_s)
             self._last_words, self._last_modes = words, modes
         self.drives.latch(self._fast_rows, image["target"] / self._counts_per_mm)
         self._last_joined, self._relatch = joined, self.drives.busy
         self._pending.clear()
+        self._pending_forces.clear()
+
+    def _latch_forces(self, rows: list[int], image: NDArray[np.void], now_s: float) -> None:
+        for index, target in zip(rows, image["target"].tolist(), strict=True):
+            self.drives.forces.aim(index, target * NEWTON_PER_PER_MILLE)
+        self._obey(rows, image, now_s)
+
+    def _obey(self, rows: list[int], image: NDArray[np.void], now_s: float) -> None:
+        """Modes and controlwords of the axes `rows`."""
+        for index, word, mode in zip(rows, image["controlword"].tolist(), image["mode"].tolist(), strict=True):
+            self.drives.modes[index] = mode
+            self.drives.control(index, word, now_s)
 
     def _latch_each(self, now_s: float) -> None:
         """The set-points of those drives that got one since the last SYNC."""
+        if self._pending_forces:
+            forces = np.frombuffer(b"".join(self._pending_forces.values()), _FORCE_RPDO)
+            self._latch_forces(list(self._pending_forces), forces, now_s)
+            self._pending_forces.clear()
+        if not self._pending:
+            self.drives.stay()
+            return
         rows = np.array(list(self._pending), dtype=np.intp)
         image = np.frombuffer(b"".join(self._pending.values()), _RPDO)
-        for index, word, mode in zip(rows.tolist(), image["controlword"].tolist(), image["mode"].tolist(), strict=True):
-            self.drives.modes[index] = mode
-            self.drives.control(index, word, now_s)
+        self._obey(rows.tolist(), image, now_s)
         self.drives.latch(rows, image["target"] / self._counts_per_mm)
         self._pending.clear()
         self._last_joined = b""
@@ -314,24 +341,15 @@ class DriveGroup:
             reached_s = max(self._step_s, last_s + self.drives.cycle_s)
             self._advance(reached_s)
             self._step_s = reached_s
-            self._react_to_lost_sync(now_s)
+            self.drives.lose_sync(now_s)
         self._coast(now_s)
-
-    def _react_to_lost_sync(self, now_s: float) -> None:
-        for index, stage in enumerate(self.drives.stages):
-            if stage is not Stage.OPERATION:
-                continue
-            if self._settings.sync_loss == "fault":
-                self.drives.trip(index, SYNC_LOST, now_s)
-            elif self._settings.sync_loss == "quick-stop":
-                self.emergency(index, SYNC_LOST)
-                self.drives.quick_stop(index, now_s)
 
     def _coast(self, now_s: float) -> None:
         """One step of the drives on their own; again every cycle while something moves, seldom otherwise."""
         plant, drives = self._plant, self.drives
         now_s = max(now_s, self._step_s)
         set_point = drives.coast(now_s, now_s - self._step_s, plant.encoder_mm)
+        self._press()
         plant.step(now_s, set_point, drives.powered, drives.braked)
         self._step_s = now_s
         self._cached, self._error = None, plant.following_error_mm()

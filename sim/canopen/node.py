@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final, Protocol
 
-from sim.canopen.dictionary import Dictionary
+from sim.canopen.dictionary import CYCLIC_RPDO, CYCLIC_TPDO, FORCE_RPDO, FORCE_TPDO, Dictionary
 from sim.canopen.sdo_server import SdoServer
 from sim.canopen.settings import DriveSettings
 from sim.wires.can_frames import CanFrame
@@ -66,15 +66,19 @@ class Node:
 
     @property
     def takes_set_points(self) -> bool:
-        return self.state == OPERATIONAL and self.dictionary.mapped(0x1400)
+        return self.state == OPERATIONAL and self.dictionary.mapped(0x1400, CYCLIC_RPDO)
+
+    @property
+    def takes_forces(self) -> bool:
+        return self.state == OPERATIONAL and self.dictionary.mapped(0x1400, FORCE_RPDO)
 
     @property
     def reports(self) -> bool:
-        return self.state == OPERATIONAL and self.dictionary.mapped(0x1800)
+        return self.state == OPERATIONAL and self.dictionary.mapped(0x1800, CYCLIC_TPDO)
 
     @property
     def reports_force(self) -> bool:
-        return self.state == OPERATIONAL and self.dictionary.mapped(0x1801)
+        return self.state == OPERATIONAL and self.dictionary.mapped(0x1801, FORCE_TPDO)
 
     def boot_up(self) -> CanFrame:
         """Become pre-operational and say so."""

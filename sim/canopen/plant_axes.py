@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final, Protocol
 
 from docking.types import Array
-from sim.canopen.drives import BoolArray
+from sim.canopen.parameters import BoolArray
 
 NEWTON_PER_COUNT: Final = 10.0
 """Unit of the load-cell object 2100h."""
@@ -17,6 +17,8 @@ class PlantAxes(Protocol):
     axes: tuple[str, ...]
 
     def step(self, t_s: float, target_mm: Array, powered: BoolArray, braked: BoolArray) -> None: ...
+
+    def press(self, force_n: Array, v_max_mm_s: Array) -> None: ...
 
     def encoder_mm(self) -> Array: ...
 
