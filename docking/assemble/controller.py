@@ -8,12 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from docking.approach import Approach, Station
+from docking.assemble.motion_side import local_motion, motion_beside
+from docking.assemble.wires import Wires
 from docking.cell import Cell
 from docking.config import CellFile, JobFile
 from docking.config.budget import noise_of
 from docking.config.build import (
     convergence_settings,
-    gravity_m_s2,
     guard_settings,
     plan_period_s,
     plan_settings,
@@ -23,30 +24,19 @@ from docking.config.cell import ModbusBus
 from docking.config.nominal import ers_points, feature_points, mate_feature_points, measured_features, target_points
 from docking.geometry import pose_from_vector
 from docking.kinematics import Positioners
-from docking.motion import QueuedMotion, StreamedMotion
-from docking.motion.monitors import Watch, WatchLimits
 from docking.motion.settle import SettleSettings
-from docking.ports import Aside, CanLink, Journal, Motion, Operator, SerialLink, Tracker, at_once
+from docking.ports import Aside, Journal, Motion, Operator, SerialLink, Tracker, at_once
 from docking.pose import Features, FitSettings
 from docking.procedure import Procedure, ProcedureSettings
 from docking.survey import Nominals, Survey, SurveySettings
 from docking.types import Array
-from drivers.canopen.positioners import CanopenPositioners
 from drivers.geocom_tracker import GeocomTracker
 from drivers.line_tracker import LineTracker
-from drivers.modbus_positioners import ModbusPositioners
+
+__all__ = ["Company", "Wires", "build_cell"]
 
 AGREEING_POINTS = 4
 """Points that must agree before the cell believes a fit: three have nothing left to prove them wrong."""
-
-
-@dataclass(frozen=True)
-class Wires:
-    """The near ends of a cell's wires: a serial line, and a CAN bus or the addresses of the positioner PLCs."""
-
-    serial: SerialLink
-    can: CanLink | None = None
-    modbus: dict[str, tuple[str, int]] | None = None
 
 
 @dataclass(frozen=True)
@@ -59,10 +49,11 @@ class Company:
     aside: Aside = at_once
 
 
-def build_cell(cell: CellFile, job: JobFile, wires: Wires, company: Company) -> Cell:
-    """The whole controller of one docking."""
+def build_cell(cell: CellFile, job: JobFile, wires: Wires, company: Company, motion: Motion | None = None) -> Cell[Procedure]:
+    """The whole controller of one docking; without `motion` the motion side runs on this very loop."""
     positioners = positioners_from(cell, job)
-    motion = _motion(cell, positioners, wires)
+    if motion is None:
+        motion = motion_beside(cell, local_motion(cell, job, wires.can, wires.modbus))
     survey = Survey(
         tracker=_tracker(cell, wires.serial),
         journal=company.journal,
@@ -86,26 +77,6 @@ def _tracker(cell: CellFile, link: SerialLink) -> Tracker:
     if cell.tracker.protocol == "geocom":
         return GeocomTracker(link, cell.tracker, covariance)
     return LineTracker(link, cell.tracker, covariance)
-
-
-def _motion(cell: CellFile, positioners: Positioners, wires: Wires) -> Motion:
-    limits = cell.limits
-    gravity = gravity_m_s2(cell)
-    watch_limits = WatchLimits(
-        following_rest_mm=limits.following_error_rest_mm,
-        following_vmax_mm=limits.following_error_vmax_mm,
-        ball_residual_mm=limits.ball_residual_mm,
-        internal_force_n=limits.internal_force_n,
-        warp_force_n=limits.warp_force_n,
-        missing_cycles=limits.missing_cycles,
-    )
-    load_cells = np.repeat([station.load_cell for station in cell.positioners], 3)
-    watch = Watch(positioners, -gravity / np.linalg.norm(gravity), watch_limits, load_cells)
-    if isinstance(cell.bus, ModbusBus):
-        return QueuedMotion(ModbusPositioners(cell, wires.modbus), watch, cell.bus.poll_s)
-    if wires.can is None:
-        raise ValueError("a CANopen cell needs the near end of its bus")
-    return StreamedMotion(CanopenPositioners(cell, wires.can), watch, limits.tick_late_cycles)
 
 
 def _nominals(cell: CellFile, job: JobFile) -> Nominals:

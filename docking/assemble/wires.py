@@ -1,0 +1,31 @@
+"""The near ends of a cell's wires, at the addresses of the cell file or of simulated devices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from docking.config import CellFile
+from docking.ports import CanLink, SerialLink
+from drivers.links.can_bus import CanBusLink
+
+Addresses = dict[str, tuple[str, int]]
+
+
+@dataclass(frozen=True)
+class Wires:
+    """The near ends of a cell's wires: a serial line, and a CAN bus or the addresses of the positioner PLCs."""
+
+    serial: SerialLink
+    can: CanLink | None = None
+    modbus: Addresses | None = None
+
+
+def near_bus(cell: CellFile, found: dict[str, Any]) -> tuple[CanLink | None, Addresses | None]:
+    """The positioners' wire: a CAN bus, or the addresses of PLCs (None: those of the cell file)."""
+    if cell.bus.kind == "modbus-tcp":
+        listed = found.get("modbus")
+        return None, {name: (str(host), int(port)) for name, (host, port) in listed.items()} if listed else None
+    if "can" in found:
+        return CanBusLink("docking-unix", found["can"], cell.bus.bitrate), None
+    return CanBusLink(cell.bus.interface, cell.bus.channel, cell.bus.bitrate), None
