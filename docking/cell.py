@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Generic, Protocol, TypeVar
 
 from docking.errors import DockingError, EventRefused
-from docking.procedure import Procedure
+from docking.ports import Journal, Motion, Operator
 from docking.state import FINAL, Effect, Event, Situation, State, step
 
 OPENING = {State.STANDBY: Event.CONNECT, State.DISABLED: Event.ENABLE, State.IDLE: Event.START_SEATED}
 """What `dock` asks for by itself until the first measurement."""
+
+RELIEVING = OPENING | {State.IDLE: Event.START_RELIEF}
+"""What `relieve` asks for by itself until the first weighing."""
 
 REQUESTS = {Effect.HOLD: "hold", Effect.RESUME: "resume", Effect.STOP: "stop"}
 """Effects that only tell the running move something."""
@@ -21,11 +26,37 @@ TOLD = {Effect.HOLD: "paused", Effect.RESUME: "resumed", Effect.STOP: "stopping"
 """What the operator hears of them."""
 
 
-class Cell:
-    """A docking cell. `dock()` runs one docking to one of the final states; `post()` takes the operator's events."""
+class Activities(Protocol):
+    """The effects of one run, and who it works with: a docking or a stress relief."""
 
-    def __init__(self, procedure: Procedure) -> None:
+    motion: Motion
+    journal: Journal
+    operator: Operator
+
+    @property
+    def effects(self) -> Mapping[Effect, Callable[[], Awaitable[Event]]]:
+        """What to do for each effect that the run may have; each answers with an event."""
+        ...
+
+    def alarm(self, error: DockingError) -> None:
+        """Keep an error in the journal and tell the operator."""
+        ...
+
+    async def close(self) -> None:
+        """Release the devices."""
+        ...
+
+
+A = TypeVar("A", bound=Activities)
+
+
+class Cell(Generic[A]):
+    """A docking cell. `dock()` and `relieve()` run to their end, `post()` takes the operator's events and `override()`
+    the speed."""
+
+    def __init__(self, procedure: A) -> None:
         self.procedure = procedure
+        self.percent = 100.0
         self.situation = Situation()
         self._events: asyncio.Queue[tuple[Event, DockingError | None]] = asyncio.Queue()
         self._activity: asyncio.Task[None] | None = None
@@ -35,17 +66,41 @@ class Cell:
         """An event from the operator; one that the table refuses is told and changes nothing."""
         self._events.put_nowait((event, None))
 
+    def override(self, percent: float) -> None:
+        """Run at `percent` of the planned speed from now on, this move and those to come.
+
+        Slower is passed on before it is recorded, faster after.
+        """
+        procedure, slower = self.procedure, percent < self.percent
+        if slower:
+            procedure.motion.override(percent)
+        procedure.journal.write("command", {"verb": "override", "percent": percent})
+        procedure.operator.notify("override", percent=percent)
+        if not slower:
+            procedure.motion.override(percent)
+        self.percent = percent
+
     async def dock(self) -> State:
         """Run from OFFLINE to a final state and release the devices; a defect in an effect is raised when they are."""
+        return await self._run(OPENING)
+
+    async def relieve(self) -> State:
+        """Run a stress relief from OFFLINE to IDLE, or to the final state that it ends in; else as `dock`."""
+        return await self._run(RELIEVING, until=Event.RELIEVED)
+
+    async def _run(self, opening: Mapping[State, Event], until: Event | None = None) -> State:
         self.post(Event.LOAD)
         asked: set[State] = set()
+        ended = False
         try:
-            while self.situation.state not in FINAL:
-                self._handle(*await self._events.get())
+            while not ended:
+                event, error = await self._events.get()
+                self._handle(event, error)
                 state = self.situation.state
-                if state in OPENING and state not in asked:
+                ended = state in FINAL or event is until
+                if state in opening and state not in asked:
                     asked.add(state)
-                    self.post(OPENING[state])
+                    self.post(opening[state])
         finally:
             if self._activity is not None and not self._activity.done():
                 self._activity.cancel()

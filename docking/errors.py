@@ -207,6 +207,18 @@ class DriveWarning(MotionError):
     code = 2130
 
 
+class ForceRose(MotionError):
+    code = 2131
+
+
+class NotRelieved(MotionError):
+    code = 2132
+
+
+class ForeignForce(MotionError):
+    code = 2133
+
+
 # 3xxx measuring and fitting --------------------------------------------------------------------------------------
 class PoseError(DockingError):
     """Measuring and fitting. `rejected` holds what the screening had found out about single points when it refused."""

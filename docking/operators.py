@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import select
 import sys
 from collections.abc import Callable
@@ -11,22 +12,28 @@ from typing import Any
 
 import numpy as np
 
+from docking.errors import DockingError
 from docking.state import Event
 from docking.types import Plan
 from docking.words import tell
 
 Say = Callable[[str], None]
 Post = Callable[[Event], None]
+Override = Callable[[float], None]
+
+HOLD_S = 30.0
+"""How long a relief step waits to be asked for; the supervisor has let go when the time is up."""
 
 
 class AutomaticOperator:
-    """Confirms every plan and declares every permissive; for simulated devices only."""
+    """Confirms every plan and declares every permissive; for simulated devices only. It never retreats and never asks
+    for a relief step: both are decisions of a person."""
 
     def __init__(self, say: Say, language: str = "en") -> None:
         self._say, self._language = say, language
 
-    def attend(self, post: Post) -> None:
-        """There is nobody who could hold or abort."""
+    def attend(self, post: Post, override: Override) -> None:
+        """There is nobody who could hold, abort or slow down."""
 
     def show(self, plan: Plan, shown: dict[str, Any]) -> None:
         """There is nobody who could look."""
@@ -34,18 +41,25 @@ class AutomaticOperator:
     async def permissives(self, names: tuple[str, ...]) -> tuple[str, ...]:
         return ()
 
-    async def confirm(self, plan: Plan, shown: dict[str, Any]) -> bool:
-        return True
+    async def confirm(self, plan: Plan, shown: dict[str, Any]) -> Event:
+        return Event.CONFIRMED
+
+    async def blocked(self, error: DockingError, *, retreatable: bool) -> Event | None:
+        return None
+
+    async def hold_to_run(self, facts: dict[str, Any]) -> bool:
+        return False
 
     def notify(self, key: str, **facts: Any) -> None:
         self._say(tell(self._language, key, **facts))
 
 
 class TerminalOperator:
-    """A person at the terminal: go, hold, resume, abort. Lines are read from standard input as they come.
+    """A person at the terminal: go, hold, resume, abort, the speed in percent, measure again, retreat, one relief step.
+    Lines are read from standard input as they come.
 
-    Abort is taken at any time. An answer counts only for a question that has been put: what was typed ahead confirms
-    nothing. When the input ends nobody watches, and the docking is aborted.
+    Abort and speed are taken at any time. An answer counts only for a question that has been put: what was typed ahead
+    confirms nothing. When the input ends nobody watches, and the docking is aborted.
     """
 
     def __init__(self, say: Say, language: str) -> None:
@@ -56,10 +70,11 @@ class TerminalOperator:
         self._answer: asyncio.Future[str] | None = None
         self._engaged = self._gone = False
         self._post: Post = lambda event: None
+        self._override: Override = lambda percent: None
 
-    def attend(self, post: Post) -> None:
-        """Begin to listen; `post` takes hold, resume and abort."""
-        self._post, self._descriptor = post, sys.stdin.fileno()
+    def attend(self, post: Post, override: Override) -> None:
+        """Begin to listen; `post` takes hold, resume and abort, `override` the speed in percent."""
+        self._post, self._override, self._descriptor = post, override, sys.stdin.fileno()
         asyncio.get_running_loop().add_reader(self._descriptor, self._readable)
 
     def _readable(self) -> None:
@@ -81,6 +96,8 @@ class TerminalOperator:
     def _take(self, word: str) -> None:
         if word in _ABORT:
             self._post(Event.ABORT)
+        elif _PERCENT.fullmatch(word) and float(word[:-1]) <= 100.0:
+            self._override(float(word[:-1]))
         elif self._answer is not None and word in self._asked:
             self._answer.set_result(word)
             self._answer = None
@@ -97,7 +114,8 @@ class TerminalOperator:
 
     def show(self, plan: Plan, shown: dict[str, Any]) -> None:
         """The deviation of every feature and the displacement of every axis."""
-        self._say("\n".join([*self._deviation(shown), *self._displacements(plan, shown)]))
+        deviation = self._deviation(shown) if "names" in shown else []
+        self._say("\n".join([*deviation, *self._displacements(plan, shown)]))
 
     def _deviation(self, shown: dict[str, Any]) -> list[str]:
         rows = zip(shown["names"], shown["error_mm"], shown["sigma_mm"], shown["tolerance_mm"], strict=True)
@@ -124,10 +142,29 @@ class TerminalOperator:
                 self.notify("not_yet", name=name)
         return ()
 
-    async def confirm(self, plan: Plan, shown: dict[str, Any]) -> bool:
-        """Wait for go; an abort ends the docking by itself."""
-        await self._ask(_GO, "go")
-        return True
+    async def confirm(self, plan: Plan, shown: dict[str, Any]) -> Event:
+        """Wait for go, or for the choice to go back the way the component came; an abort ends the run by itself."""
+        if not shown.get("retreatable"):
+            await self._ask(_GO, "go")
+            return Event.CONFIRMED
+        return Event.RETREAT if await self._ask(_GO | _RETREAT, "go_or_retreat") in _RETREAT else Event.CONFIRMED
+
+    async def blocked(self, error: DockingError, *, retreatable: bool) -> Event:
+        """Wait for the choice to measure again or to retreat; an abort ends the run by itself."""
+        self.notify("unseen", error=error)
+        if not retreatable:
+            await self._ask(_AGAIN, "again_only")
+            return Event.AGAIN
+        word = await self._ask(_AGAIN | _RETREAT, "again_or_retreat")
+        return Event.RETREAT if word in _RETREAT else Event.AGAIN
+
+    async def hold_to_run(self, facts: dict[str, Any]) -> bool:
+        """Wait for the one key that asks for one step; any other answer, and none in time, lets go."""
+        try:
+            word = await asyncio.wait_for(self._ask(_STEP | _NO, "relief_step", **facts, hold_s=HOLD_S), HOLD_S)
+        except TimeoutError:
+            return False
+        return word in _STEP
 
     async def _ask(self, expected: frozenset[str], key: str, **facts: Any) -> str:
         self._engaged, self._asked = True, expected
@@ -139,7 +176,11 @@ class TerminalOperator:
         self.notify(key, **facts)
         if self._gone:
             self._leave()
-        return await answer
+        try:
+            return await answer
+        finally:
+            if self._answer is answer:
+                self._answer = None
 
     def notify(self, key: str, **facts: Any) -> None:
         self._say(tell(self._language, key, **facts))
@@ -151,3 +192,7 @@ _RESUME = frozenset({"r", "resume", "继续"})
 _ABORT = frozenset({"a", "abort", "q", "中止"})
 _YES = frozenset({"y", "yes", "是"})
 _NO = frozenset({"n", "no", "否"})
+_AGAIN = frozenset({"m", "measure", "测量"})
+_RETREAT = frozenset({"r", "retreat", "退回"})
+_STEP = frozenset({"s", "step", "一步"})
+_PERCENT = re.compile(r"\d{1,3}(\.\d)?[%％]")

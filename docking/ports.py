@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
 
+from docking.errors import DockingError
 from docking.state import Event
 from docking.types import Array, Feedback, Identity, MoveResult, Plan, Reading
 
@@ -32,10 +33,14 @@ class Tracker(Protocol):
 
 
 class StreamedPositioners(Protocol):
-    """Axes that take one set-point each cycle and apply all of them at one common instant (CANopen CSP + SYNC)."""
+    """Axes that take one set-point each cycle and apply all of them at one common instant (CANopen CSP + SYNC).
+
+    `a_quick_mm_s2` (m,) are the axes' quick-stop decelerations.
+    """
 
     axes: tuple[str, ...]
     cycle_s: float
+    a_quick_mm_s2: Array
 
     async def bring_up(self) -> tuple[Identity, ...]:
         """Prove identity and settings of every node; leave the axes disabled and reporting."""
@@ -45,12 +50,36 @@ class StreamedPositioners(Protocol):
         """Enable the driven axes, each first commanded to where it stands; return their read-back."""
         ...
 
-    def exchange(self, setpoint_mm: Array) -> Feedback:
-        """Send set-points (m,) and the common SYNC; return the newest read-back. Passive entries are ignored."""
+    def latest(self) -> Feedback:
+        """The newest read-back."""
+        ...
+
+    def send(self, setpoint_mm: Array) -> None:
+        """Send set-points (m,) and the common SYNC. Passive entries are ignored."""
+        ...
+
+    async def arm_stops(self, peak_mm_s: Array, t_stop_s: float) -> None:
+        """At standstill: let every drive's own quick stop take `t_stop_s` from its planned peak speed (m,)."""
+        ...
+
+    async def restore_stops(self) -> None:
+        """Give every drive its full quick-stop deceleration back, as a move of a single axis needs it."""
         ...
 
     def quick_stop(self) -> None:
         """Tell every drive to stop by itself at once. Never waits, never raises."""
+        ...
+
+    async def brake(self) -> None:
+        """At standstill: close all brakes and, where they report closed, take the torque. `send` goes on meanwhile."""
+        ...
+
+    def go_silent(self) -> None:
+        """End SYNC and heartbeat for good: watchdogs and safety relay act. Never waits, never raises."""
+        ...
+
+    async def reset_faults(self) -> None:
+        """On a person's order: reset drives in fault, forget what was reported. `send` goes on meanwhile."""
         ...
 
     async def close(self) -> None:
@@ -108,6 +137,12 @@ class Motion(Protocol):
         """`hold`, `resume` or `stop`, all on the path. Never waits; kept for the start when it comes before it."""
         ...
 
+    def override(self, percent: float) -> None:
+        """Run plans at 0 to 100 % of their speed from now on, the path unchanged: only the rate of path time changes,
+        with the plan's own slew. Never waits; kept over holds, resumes and from move to move until it is set anew.
+        Raises BadArgument outside 0 to 100, and nothing changes."""
+        ...
+
     def feedback(self) -> Feedback:
         """The newest read-back. Raises the fault that the motion side holds until the next `enable`."""
         ...
@@ -126,20 +161,29 @@ class Journal(Protocol):
 class Operator(Protocol):
     """Who confirms. Dry-run confirms by itself; the terminal asks a person."""
 
-    def attend(self, post: Callable[[Event], None]) -> None:
-        """Begin: `post` takes the operator's hold, resume and abort at any time."""
+    def attend(self, post: Callable[[Event], None], override: Callable[[float], None]) -> None:
+        """Begin: `post` takes the operator's hold, resume and abort at any time, `override` the speed in percent."""
         ...
 
     def show(self, plan: Plan, shown: dict[str, Any]) -> None:
-        """Show the deviation that was measured and the displacement of every axis that is planned."""
+        """Show the deviation that was measured, where one is known, and the planned displacement of every axis."""
         ...
 
     async def permissives(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """Ask for the named inputs; return those that are not given."""
         ...
 
-    async def confirm(self, plan: Plan, shown: dict[str, Any]) -> bool:
-        """True = go, False = abort."""
+    async def confirm(self, plan: Plan, shown: dict[str, Any]) -> Event:
+        """CONFIRMED or DECLINED, or RETREAT where `shown` says that it is `retreatable`."""
+        ...
+
+    async def blocked(self, error: DockingError, *, retreatable: bool) -> Event | None:
+        """The component cannot be measured: AGAIN or, where there is a way back, RETREAT. None when nobody is there
+        to decide: then the error stands."""
+        ...
+
+    async def hold_to_run(self, facts: dict[str, Any]) -> bool:
+        """Whether a supervisor asks for the next relief step, now: False on anything else and when the time is up."""
         ...
 
     def notify(self, key: str, **facts: Any) -> None:

@@ -7,7 +7,7 @@ the first frame of its move leaves.
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -16,25 +16,33 @@ from docking import records
 from docking.approach import Approach, Station
 from docking.errors import (
     AmbiguousSet,
+    DegenerateTargets,
     DockingError,
     FitResidual,
     FrameImplausible,
     NotCongruent,
     PermissiveMissing,
     PlanStale,
+    TargetLost,
+    TooFewPoints,
 )
 from docking.independent_points import IndependentPoints
 from docking.kinematics import Positioners, ball_reactions_n, figure_residual_mm, pose_from_axes, sink_mm
 from docking.motion.settle import SettleSettings, settle
-from docking.planning import Action, Attempt, GuardSettings, PlanRequest, PlanSettings, check_correction, make_plan
+from docking.motion.weighing import weigh
+from docking.planning import Action, GuardSettings, PlanRequest, PlanSettings, check_correction, make_plan, retreat_plan
 from docking.ports import Journal, Motion, Operator
 from docking.pose import fit_pose, screen
+from docking.progress import Progress
 from docking.state import Effect, Event
 from docking.survey import Survey
-from docking.types import Alarm, Array, FeatureErrors, Fit, Plan, Pose
+from docking.types import Array, Fit, Plan, Pose
 
 START_TOLERANCE_MM = 0.05
 """How far an axis may stand from where its plan begins."""
+
+UNSEEN = (TargetLost, TooFewPoints, DegenerateTargets)
+"""The component cannot be measured, as with a blocked line of sight: a person clears it, or retreats without a fit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,27 +64,6 @@ class ProcedureSettings:
     fit_age_s: float
 
 
-@dataclass
-class Progress:
-    """Where a docking stands."""
-
-    stage: int = 0
-    corrections: int = 0
-    passes: int = 0
-    moves: int = 0
-    commanded_mm: Array | None = None
-    X_WC: Fit | None = None
-    fitted_at_s: float = float("nan")
-    errors: FeatureErrors | None = None
-    plan: Plan | None = None
-    kind: str = "align"
-    history: list[Attempt] = field(default_factory=list)
-    alarms: list[Alarm] = field(default_factory=list)
-    rejected: set[str] = field(default_factory=set)
-    max_residual_mm: float = 0.0
-    max_internal_force_n: float = 0.0
-
-
 class Procedure:
     """The effects of the state table, and what is known while a docking runs."""
 
@@ -92,12 +79,15 @@ class Procedure:
         self._settings, self._approach, self._survey = settings, approach, survey
         self.motion, self.journal, self.operator = motion, journal, operator
         self.progress = Progress()
+        self._unseen: DockingError | None = None
         self._independent = IndependentPoints(survey, journal, settings.target_residual_mm, self._set_aside)
         self.effects: dict[Effect, Callable[[], Awaitable[Event]]] = {
             Effect.CONNECT: self._connect,
             Effect.ENABLE: self._enable,
             Effect.LOCATE: self._locate,
             Effect.MEASURE: self._measure,
+            Effect.OFFER: self._offer,
+            Effect.PLAN_RETREAT: self._plan_retreat,
             Effect.FIT: self._fit,
             Effect.JUDGE: self._judge,
             Effect.PLAN: self._plan,
@@ -145,7 +135,11 @@ class Procedure:
         passes = self._survey.settings.passes
         guess = pose_from_axes(self._settings.positioners, self._commanded())
         self.operator.notify("measuring_component", passes=passes)
-        await self._survey.measure_component(guess, self._settings.X_WM, passes, more=more)
+        try:
+            await self._survey.measure_component(guess, self._settings.X_WM, passes, more=more)
+        except UNSEEN as error:
+            self._unseen = error
+            return Event.UNSEEN
         p.passes = passes if not more else p.passes + passes
         return Event.MEASURED
 
@@ -162,6 +156,9 @@ class Procedure:
                 raise
             self.operator.notify("again", error=refusal)
             return Event.MEASURE_MORE
+        except UNSEEN as error:
+            self._unseen = error
+            return Event.UNSEEN
         self.journal.write("fit", records.fit_record(fit, "component", self._station().name))
         p.rejected |= {r.name for r in fit.rejected}
         if fit.rejected:
@@ -173,7 +170,25 @@ class Procedure:
             raise FitResidual("rms", value=fit.rms_mm, limit=self._settings.rms_limit_mm)
         self._check_against_axes(fit)
         p.X_WC, p.fitted_at_s = fit, survey.clock()
+        await self._tare()
         return Event.FITTED
+
+    async def _tare(self) -> None:
+        """Weigh the part once, before its first move: as unstrained as it was taken. A stress relief starts from it."""
+        if self.progress.tared or not np.all(np.isfinite(self.motion.feedback().force_n)):
+            return
+        self.progress.tared = True
+        weighing = await weigh(self.motion, self._settings.settle)
+        self.journal.write("tare", records.weighing_record(self.motion.axes, weighing))
+
+    async def _offer(self) -> Event:
+        error, p = _known(self._unseen, "measurement"), self.progress
+        answer = await self.operator.blocked(error, retreatable=bool(p.way))
+        if answer is None:
+            raise error
+        self.journal.write("unseen", {"error": error.text(), "answer": answer.value})
+        p.passes = 0
+        return answer
 
     def _check_against_axes(self, fit: Fit) -> None:
         """The fitted pose must put the balls where the loaded sockets are: finds swapped axes and wrong frames."""
@@ -224,7 +239,7 @@ class Procedure:
             correction = self._approach.correction(self._component_fit(), self._mate_fit(), station)
             gap_mm = None if p.moves == 0 else station.standoff_mm
             check_correction(correction, self._settings.guard, station.name, gap_mm)
-            p.corrections, p.kind = p.corrections + 1, "align"
+            p.corrections, p.kind, p.stood_at = p.corrections + 1, "align", p.stage
             return Event.MOVE_NEEDED
         if verdict.error is not None:
             if verdict.action is Action.ABORT:
@@ -232,7 +247,7 @@ class Procedure:
             self.alarm(verdict.error)
             return Event.NOT_ACCEPTED
         if station is not self._approach.stations[-1]:
-            p.stage, p.corrections, p.kind, p.history = p.stage + 1, 0, "approach", []
+            p.stood_at, p.stage, p.corrections, p.kind, p.history = p.stage, p.stage + 1, 0, "approach", []
             return Event.MOVE_NEEDED
         self.journal.write("features", records.features_record(_known(p.errors, "errors"), station.name, "final"))
         return Event.ACCEPTED
@@ -249,38 +264,51 @@ class Procedure:
             speed_mm_s=station.speed_mm_s,
             period_s=self._settings.period_s,
             linear_interpolation=self._settings.linear_interpolation,
+            scene=self._approach.scene(self._component_fit(), self._mate_fit(), station),
         )
         p.plan = await self._survey.aside(lambda: make_plan(request, self._settings.positioners, self._settings.plan))
         self.journal.write("plan", records.plan_record(p.plan))
         return Event.PLANNED
 
+    async def _plan_retreat(self) -> Event:
+        """The last move reversed. It rests on what was executed, not on a fit."""
+        p = self.progress
+        executed = [(step.plan, step.path_time_s) for step in p.way]
+        q_now_mm, driven = self._where_axes_are(), self._settings.positioners.driven
+        p.plan = await self._survey.aside(lambda: retreat_plan(executed, q_now_mm, driven, p.moves + 1))
+        self.journal.write("plan", records.plan_record(p.plan))
+        return Event.PLANNED
+
     async def _ask(self) -> Event:
-        plan, shown = self._planned(), await self._shown()
+        plan, p = self._planned(), self.progress
+        back = plan.kind == "retreat"
+        shown = {**({} if back else await self._deviation()), "retreatable": bool(p.way) and not back}
+        shown["passive"] = [
+            a for a, on in zip(self.motion.axes, self._settings.positioners.driven, strict=True) if not on
+        ]
         self.operator.show(plan, shown)
-        station = self._station()
+        station = self._approach.stations[p.way[-1].stage] if back else self._station()
         missing = await self.operator.permissives(station.permissives)
         body = {"stage": station.name, "declared": [n for n in station.permissives if n not in missing]}
         self.journal.write("permissives", {**body, "missing": list(missing)})
         if missing:
             raise PermissiveMissing(missing[0], value=station.name)
-        go = await self.operator.confirm(plan, shown)
-        self.journal.write("confirm", {"plan_hash": plan.plan_hash, "go": go})
-        if go and not (self._fit_age_s() <= self._settings.fit_age_s):
+        answer = await self.operator.confirm(plan, shown)
+        self.journal.write("confirm", {"plan_hash": plan.plan_hash, "go": answer is Event.CONFIRMED})
+        if answer is Event.CONFIRMED and not back and not (self._fit_age_s() <= self._settings.fit_age_s):
             self.operator.notify("stale", age_s=self._fit_age_s(), limit_s=self._settings.fit_age_s)
-            self.progress.passes = 0
+            p.passes = 0
             return Event.STALE
-        return Event.CONFIRMED if go else Event.DECLINED
+        return answer
 
     def _fit_age_s(self) -> float:
         return self._survey.clock() - self.progress.fitted_at_s
 
-    async def _shown(self) -> dict[str, Any]:
-        """The features' deviation from the goal of the planned move, and which axes only follow."""
-        station, driven = self._station(), self._settings.positioners.driven
-        fit, mate, drift_mm = self._component_fit(), self._mate_fit(), self._drift_sigma_mm()
+    async def _deviation(self) -> dict[str, Any]:
+        """The features' deviation from the goal of the planned move."""
+        station, fit, mate, drift_mm = self._station(), self._component_fit(), self._mate_fit(), self._drift_sigma_mm()
         errors = await self._survey.aside(lambda: self._approach.errors(fit, mate, station, drift_mm))
-        passive = [axis for axis, on in zip(self.motion.axes, driven, strict=True) if not on]
-        return {**records.features_record(errors, station.name, "before"), "passive": passive}
+        return records.features_record(errors, station.name, "before")
 
     async def _move(self) -> Event:
         p, plan = self.progress, self._planned()
@@ -290,10 +318,7 @@ class Procedure:
         facts = {"kind": plan.kind, "stage": plan.stage, "limited_by": plan.speed_limited_by}
         self.operator.notify("moving", duration_s=plan.duration_s, **facts)
         result = await self.motion.start(plan.plan_hash)
-        p.moves, p.passes = p.moves + 1, 0
-        p.commanded_mm = result.commanded_mm
-        p.max_residual_mm = max(p.max_residual_mm, result.max_residual_mm)
-        p.max_internal_force_n = max(p.max_internal_force_n, result.max_internal_force_n)
+        p.moved(plan, result)
         self.journal.write("moved", records.moved_record(plan, result))
         if result.cause is not None:
             raise result.cause

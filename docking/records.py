@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from docking.geometry import pose_to_vector
-from docking.types import Alarm, FeatureErrors, Fit, MoveResult, Plan, Pose, Rejection
+from docking.planning.relief import Strain, Weighing
+from docking.types import Alarm, Array, FeatureErrors, Fit, MoveResult, Plan, PlanBounds, Pose, Rejection
 
 POSE_KEYS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
 
@@ -85,6 +86,33 @@ def plan_record(plan: Plan) -> dict[str, Any]:
             "shift_mm": c.shift_mm.tolist(),
             "pivot_mm": c.pivot_W_mm.tolist(),
         },
+        "bounds": None if plan.bounds is None else bounds_record(plan.axes, plan.bounds),
+    }
+
+
+def bounds_record(axes: tuple[str, ...], bounds: PlanBounds) -> dict[str, Any]:
+    """What the pre-flight foresees; unknown distances are None."""
+
+    def by_axis(values: Array) -> dict[str, float]:
+        return dict(zip(axes, values.tolist(), strict=True))
+
+    def known(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    return {
+        "peak_mm_s": by_axis(bounds.peak_mm_s),
+        "quick_stop_s": bounds.quick_stop_s,
+        "jam_mm": by_axis(bounds.jam_mm),
+        "jam_n": by_axis(bounds.jam_n),
+        "ramp_mm": by_axis(bounds.ramp_mm),
+        "residual_mm": bounds.residual_mm,
+        "force_n": bounds.force_n,
+        "warp_n": bounds.warp_n,
+        "clearance_mm": known(bounds.clearance_mm),
+        "clearance_asked_mm": known(bounds.clearance_asked_mm),
+        "clearance_s": known(bounds.clearance_s),
+        "duration_s": bounds.duration_s,
+        "limits": [list(row) for row in bounds.limits],
     }
 
 
@@ -114,6 +142,21 @@ def moved_record(plan: Plan, result: MoveResult) -> dict[str, Any]:
         "max_following_error_mm": dict(zip(plan.axes, result.max_following_error_mm.tolist(), strict=True)),
         "max_consistency_residual_mm": result.max_residual_mm,
         "max_internal_force_n": result.max_internal_force_n,
+    }
+
+
+def weighing_record(axes: tuple[str, ...], weighing: Weighing) -> dict[str, Any]:
+    rows = ("position_mm", weighing.position_mm), ("force_n", weighing.force_n), ("noise_n", weighing.noise_n)
+    return {name: dict(zip(axes, values.tolist(), strict=True)) for name, values in rows}
+
+
+def strain_record(names: tuple[str, ...], strain: Strain, axes: tuple[str, ...], weighing: Weighing) -> dict[str, Any]:
+    return {
+        **weighing_record(axes, weighing),
+        "internal_force_n": dict(zip(names, strain.ball_n.tolist(), strict=True)),
+        "ball_force_n": dict(zip(names, strain.force_n.tolist(), strict=True)),
+        "foreign_force_n": dict(zip(names, strain.foreign_n.tolist(), strict=True)),
+        "sigma_n": strain.sigma_n,
     }
 
 

@@ -28,15 +28,20 @@ class State(Enum):
     LIFT = "lift"
     LEVEL = "level"
     MEASURE = "measure"
+    BLOCKED = "blocked"
     FIT = "fit"
     VERIFY = "verify"
     PLAN = "plan"
     CONFIRM = "confirm"
+    RETREAT = "retreat"
+    CONFIRM_RETREAT = "confirm-retreat"
     MOVE = "move"
     PAUSED = "paused"
     SETTLE = "settle"
     DOCKED = "docked"
     OUT_OF_TOLERANCE = "out-of-tolerance"
+    RELIEVE = "relieve"
+    RELIEF_STEP = "relief-step"
     STOPPING = "stopping"
     FAULT = "fault"
     RECOVER = "recover"
@@ -61,6 +66,9 @@ class Event(Enum):
     LOAD_TAKEN = "load-taken"
     LEVELLED = "levelled"
     MEASURED = "measured"
+    UNSEEN = "unseen"
+    AGAIN = "again"
+    RETREAT = "retreat"
     FITTED = "fitted"
     MOVE_NEEDED = "move-needed"
     MEASURE_MORE = "measure-more"
@@ -76,6 +84,10 @@ class Event(Enum):
     ABORT = "abort"
     STOPPED = "stopped"
     SETTLED = "settled"
+    START_RELIEF = "start-relief"
+    STEP_ASKED = "step-asked"
+    RELEASED = "released"
+    RELIEVED = "relieved"
     FAULTED = "faulted"
     RESET = "reset"
     CLOSE = "close"
@@ -96,12 +108,16 @@ class Effect(Enum):
     FIT = "fit the pose"
     JUDGE = "compare with the stage's goal"
     PLAN = "plan and check the move"
+    OFFER = "ask whether to measure again or to retreat"
+    PLAN_RETREAT = "plan the way back"
     ASK = "show the plan and ask"
     MOVE = "run the plan"
     HOLD = "hold on the path"
     RESUME = "go on along the path"
     STOP = "stop on the path"
     SETTLE = "wait until at rest"
+    WEIGH = "weigh the strain and ask for one step"
+    STEP = "run one step of the relief"
 
 
 @dataclass(frozen=True)
@@ -140,6 +156,10 @@ TABLE: dict[tuple[State, Event], Transition] = {
     (S.LEVEL, E.LEVELLED): Transition(S.MEASURE, (F.MEASURE,)),
     (S.MEASURE_FRAME, E.FRAME_MEASURED): Transition(S.MEASURE, (F.MEASURE,)),
     (S.MEASURE, E.MEASURED): Transition(S.FIT, (F.FIT,)),
+    (S.MEASURE, E.UNSEEN): Transition(S.BLOCKED, (F.OFFER,)),
+    (S.FIT, E.UNSEEN): Transition(S.BLOCKED, (F.OFFER,)),
+    (S.BLOCKED, E.AGAIN): Transition(S.MEASURE, (F.MEASURE,)),
+    (S.BLOCKED, E.RETREAT): Transition(S.RETREAT, (F.PLAN_RETREAT,)),
     (S.FIT, E.FITTED): Transition(S.VERIFY, (F.JUDGE,)),
     (S.FIT, E.MEASURE_MORE): Transition(S.MEASURE, (F.MEASURE,)),
     (S.VERIFY, E.MOVE_NEEDED): Transition(S.PLAN, (F.PLAN,)),
@@ -150,6 +170,10 @@ TABLE: dict[tuple[State, Event], Transition] = {
     (S.CONFIRM, E.CONFIRMED): Transition(S.MOVE, (F.MOVE,)),
     (S.CONFIRM, E.DECLINED): Transition(S.RECOVER),
     (S.CONFIRM, E.STALE): Transition(S.MEASURE, (F.MEASURE,)),
+    (S.CONFIRM, E.RETREAT): Transition(S.RETREAT, (F.PLAN_RETREAT,)),
+    (S.RETREAT, E.PLANNED): Transition(S.CONFIRM_RETREAT, (F.ASK,)),
+    (S.CONFIRM_RETREAT, E.CONFIRMED): Transition(S.MOVE, (F.MOVE,)),
+    (S.CONFIRM_RETREAT, E.DECLINED): Transition(S.RECOVER),
     (S.MOVE, E.HOLD): Transition(S.PAUSED, (F.HOLD,)),
     (S.MOVE, E.MOVED): Transition(S.SETTLE, (F.SETTLE,)),
     (S.MOVE, E.ABORT): Transition(S.STOPPING, (F.STOP,)),
@@ -159,6 +183,14 @@ TABLE: dict[tuple[State, Event], Transition] = {
     (S.STOPPING, E.STOPPED): Transition(S.RECOVER),
     (S.STOPPING, E.MOVED): Transition(S.RECOVER),
     (S.SETTLE, E.SETTLED): Transition(S.MEASURE, (F.MEASURE,)),
+    (S.IDLE, E.START_RELIEF): Transition(S.RELIEVE, (F.WEIGH,)),
+    (S.RELIEVE, E.STEP_ASKED): Transition(S.RELIEF_STEP, (F.STEP,)),
+    (S.RELIEVE, E.RELEASED): Transition(S.RECOVER),
+    (S.RELIEVE, E.RELIEVED): Transition(S.IDLE),
+    (S.RELIEF_STEP, E.MOVED): Transition(S.RELIEVE, (F.WEIGH,)),
+    (S.RELIEF_STEP, E.STOPPED): Transition(S.RECOVER),
+    (S.RELIEF_STEP, E.HOLD): Transition(S.STOPPING, (F.STOP,)),
+    (S.RELIEF_STEP, E.ABORT): Transition(S.STOPPING, (F.STOP,)),
     (S.FAULT, E.RESET): Transition(S.RECOVER),
     (S.RECOVER, E.ENABLE): Transition(S.DISABLED, (F.ENABLE,)),
     (S.DOCKED, E.CLOSE): Transition(S.STANDBY),
@@ -166,14 +198,22 @@ TABLE: dict[tuple[State, Event], Transition] = {
 }
 
 AT_REST = frozenset(
-    {S.STANDBY, S.DISABLED, S.IDLE, S.MEASURE_FRAME, S.MEASURE, S.FIT, S.VERIFY, S.PLAN, S.CONFIRM, S.SETTLE}
+    {
+        *(S.STANDBY, S.DISABLED, S.IDLE, S.MEASURE_FRAME, S.MEASURE, S.BLOCKED, S.FIT, S.VERIFY, S.PLAN, S.CONFIRM),
+        *(S.RETREAT, S.CONFIRM_RETREAT, S.SETTLE, S.RELIEVE),
+    }
 )
 """States with nothing moving, from which the operator can leave at once."""
 
 TABLE |= {(state, E.ABORT): Transition(S.RECOVER) for state in AT_REST}
 TABLE |= {(state, E.FAULTED): Transition(S.FAULT) for state in S if state is not S.FAULT}
 
-POSE_UNKNOWN_IN = frozenset({S.OFFLINE, S.STANDBY, S.DISABLED, S.MOVE, S.STOPPING, S.FAULT, S.RECOVER})
+POSE_UNKNOWN_IN = frozenset(
+    {
+        *(S.OFFLINE, S.STANDBY, S.DISABLED, S.MOVE, S.RELIEVE, S.RELIEF_STEP),
+        *(S.STOPPING, S.FAULT, S.RECOVER),
+    }
+)
 """Entering one of these revokes the knowledge of the pose; only a fit restores it."""
 
 FINAL = frozenset({S.DOCKED, S.OUT_OF_TOLERANCE, S.RECOVER, S.FAULT})

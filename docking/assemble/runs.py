@@ -24,7 +24,7 @@ from docking.errors import BadArgument, FileUnreadable, FileUnwritable
 from docking.journal import JournalFile, read
 from docking.operators import AutomaticOperator, TerminalOperator
 from docking.ports import Operator, at_once
-from docking.procedure import Progress
+from docking.progress import Progress
 from docking.records import alarm_record
 from docking.state import Event, State
 from docking.version import VERSION
@@ -192,7 +192,7 @@ async def _dock(run: _Run) -> dict[str, Any]:
         journal.write("run_started", _started(run), durable=True)
         company = Company(journal, run.operator, loop.time, aside if run.real else at_once)
         cell = build_cell(run.files.cell, run.files.job, run.wires, company)
-        run.operator.attend(cell.post)
+        run.operator.attend(cell.post, cell.override)
         if run.real:
             on_interrupt(lambda: _abort(cell, run.operator))
         state = await cell.dock()

@@ -304,19 +304,19 @@ def test_a_run_that_is_cancelled_in_a_move_stops_on_the_path(name, share, tmp_pa
 class Aborting(AutomaticOperator):
     """Aborts half a second after the first confirmation."""
 
-    def attend(self, post) -> None:
+    def attend(self, post, override) -> None:
         self._post = post
 
-    async def confirm(self, plan, shown) -> bool:
+    async def confirm(self, plan, shown) -> Event:
         asyncio.get_running_loop().call_later(0.5, self._post, Event.ABORT)
-        return True
+        return Event.CONFIRMED
 
 
 class Declining(AutomaticOperator):
     """Says no to the first plan."""
 
-    async def confirm(self, plan, shown) -> bool:
-        return False
+    async def confirm(self, plan, shown) -> Event:
+        return Event.DECLINED
 
 
 class Withholding(AutomaticOperator):

@@ -34,7 +34,12 @@ LOCK_BALLS        BALLS_LOCKED         LIFT              TAKE_LOAD
 LIFT              LOAD_TAKEN           LEVEL             LEVEL
 LEVEL             LEVELLED             MEASURE           MEASURE
 MEASURE           MEASURED             FIT               FIT
+MEASURE           UNSEEN               BLOCKED           OFFER
 MEASURE           ABORT                RECOVER
+BLOCKED           AGAIN                MEASURE           MEASURE
+BLOCKED           RETREAT              RETREAT           PLAN_RETREAT
+BLOCKED           ABORT                RECOVER
+FIT               UNSEEN               BLOCKED           OFFER
 FIT               FITTED               VERIFY            JUDGE
 FIT               MEASURE_MORE         MEASURE           MEASURE
 FIT               ABORT                RECOVER
@@ -48,7 +53,13 @@ PLAN              ABORT                RECOVER
 CONFIRM           CONFIRMED            MOVE              MOVE
 CONFIRM           DECLINED             RECOVER
 CONFIRM           STALE                MEASURE           MEASURE
+CONFIRM           RETREAT              RETREAT           PLAN_RETREAT
 CONFIRM           ABORT                RECOVER
+RETREAT           PLANNED              CONFIRM_RETREAT   ASK
+RETREAT           ABORT                RECOVER
+CONFIRM_RETREAT   CONFIRMED            MOVE              MOVE
+CONFIRM_RETREAT   DECLINED             RECOVER
+CONFIRM_RETREAT   ABORT                RECOVER
 MOVE              HOLD                 PAUSED            HOLD
 MOVE              MOVED                SETTLE            SETTLE
 MOVE              ABORT                STOPPING          STOP
@@ -59,6 +70,15 @@ STOPPING          STOPPED              RECOVER
 STOPPING          MOVED                RECOVER
 SETTLE            SETTLED              MEASURE           MEASURE
 SETTLE            ABORT                RECOVER
+IDLE              START_RELIEF         RELIEVE           WEIGH
+RELIEVE           STEP_ASKED           RELIEF_STEP       STEP
+RELIEVE           RELEASED             RECOVER
+RELIEVE           RELIEVED             IDLE
+RELIEVE           ABORT                RECOVER
+RELIEF_STEP       MOVED                RELIEVE           WEIGH
+RELIEF_STEP       STOPPED              RECOVER
+RELIEF_STEP       HOLD                 STOPPING          STOP
+RELIEF_STEP       ABORT                STOPPING          STOP
 FAULT             RESET                RECOVER
 RECOVER           ENABLE               DISABLED          ENABLE
 DOCKED            CLOSE                STANDBY
@@ -133,15 +153,37 @@ def reachable(start: Situation, *, without: set[Event] = frozenset()) -> set[Sit
 @pytest.mark.parametrize("missing", [E.MEASURED, E.FITTED, E.PLANNED, E.CONFIRMED])
 @pytest.mark.parametrize("origin", [State.FAULT, State.RECOVER, State.OFFLINE])
 def test_nothing_moves_without_measuring_fitting_planning_and_a_confirmation(origin, missing):
-    states = {s.state for s in reachable(Situation(origin), without={missing})}
+    states = {s.state for s in reachable(Situation(origin), without={missing, E.RETREAT})}
     assert State.MOVE not in states
+    assert missing in (E.MEASURED, E.FITTED) or State.MOVE not in {
+        s.state for s in reachable(Situation(origin), without={missing})
+    }, "a retreat needs no fit, but a plan and a confirmation"
     assert State.MOVE in {s.state for s in reachable(Situation(origin))}
 
 
 @pytest.mark.parametrize("missing", [E.MEASURED, E.FITTED, E.PLANNED, E.CONFIRMED])
 def test_a_second_move_needs_all_four_again(missing):
     settled = after(*TO_MOVE, E.MOVED)
-    assert State.MOVE not in {s.state for s in reachable(settled, without={missing})}
+    assert State.MOVE not in {s.state for s in reachable(settled, without={missing, E.RETREAT})}
+
+
+def test_a_retreat_leads_back_to_a_measurement_and_nowhere_else():
+    blocked = after(*TO_MOVE, E.MOVED, E.SETTLED, E.UNSEEN)
+    assert (blocked.state, blocked.position_known) == (State.BLOCKED, False)
+    back = after(E.RETREAT, E.PLANNED, E.CONFIRMED, start=blocked)
+    assert back.state is State.MOVE
+    settled = after(E.MOVED, start=back)
+    measured = after(E.SETTLED, start=settled)
+    assert (measured.state, measured.position_known) == (State.MEASURE, False)
+
+
+@pytest.mark.parametrize("missing", [E.START_RELIEF, E.STEP_ASKED, E.ENABLED])
+def test_no_single_axis_moves_unless_somebody_asks_for_the_step(missing):
+    stepping = {s.state for s in reachable(Situation(), without={missing})}
+    assert State.RELIEF_STEP not in stepping
+    after_a_step = after(E.LOAD, E.CONNECTED, E.ENABLED, E.START_RELIEF, E.STEP_ASKED, E.MOVED)
+    assert State.RELIEF_STEP not in {s.state for s in reachable(after_a_step, without={E.STEP_ASKED})}
+    assert not any(s.position_known for s in reachable(after_a_step, without={E.FITTED}))
 
 
 def test_a_paused_move_is_resumed_without_a_plan_but_a_stopped_one_is_not():

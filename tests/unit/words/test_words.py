@@ -13,9 +13,9 @@ from docking.words import LANGUAGES, tell, texts
 
 ROOT = Path(__file__).parents[3]
 SAID = re.compile(
-    r'(?:notify|tell|_ask)\(\s*(?:language\(\), |self\._language, |request\.language, |_YES \| _NO, |_GO, )?"(\w+)"'
+    r'(?:notify|tell|_ask)\(\s*(?:language\(\), |self\._language, |request\.language, |[_A-Z| ]+, )?"(\w+)"'
 )
-OUTCOMES = {"docked", "out_of_tolerance", "stopped", "fault", "refused"}
+OUTCOMES = {"docked", "relieved", "out_of_tolerance", "stopped", "fault", "refused"}
 
 
 def fields(text: str) -> set[str]:

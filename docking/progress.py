@@ -1,0 +1,54 @@
+"""Where a docking stands: what is known, what has been done."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from docking.planning import Attempt
+from docking.types import Alarm, Array, FeatureErrors, Fit, MoveResult, Plan
+
+
+@dataclass(frozen=True, eq=False)
+class Executed:
+    """A plan that has been run to `path_time_s`, for the `stage` (index) that the component stood at before."""
+
+    plan: Plan
+    path_time_s: float
+    stage: int
+
+
+@dataclass
+class Progress:
+    """Where a docking stands. `way` is what a retreat would go back: the moves made, oldest first."""
+
+    stage: int = 0
+    corrections: int = 0
+    passes: int = 0
+    moves: int = 0
+    commanded_mm: Array | None = None
+    X_WC: Fit | None = None
+    fitted_at_s: float = float("nan")
+    errors: FeatureErrors | None = None
+    plan: Plan | None = None
+    kind: str = "align"
+    stood_at: int = 0
+    tared: bool = False
+    way: list[Executed] = field(default_factory=list)
+    history: list[Attempt] = field(default_factory=list)
+    alarms: list[Alarm] = field(default_factory=list)
+    rejected: set[str] = field(default_factory=set)
+    max_residual_mm: float = 0.0
+    max_internal_force_n: float = 0.0
+
+    def moved(self, plan: Plan, result: MoveResult) -> None:
+        """Keep how a move ended. A move along the way is added to it; one back along it is taken off, and leaves
+        everything to be measured anew at the stage that it led back to."""
+        self.moves, self.passes = self.moves + 1, 0
+        self.commanded_mm = result.commanded_mm
+        self.max_residual_mm = max(self.max_residual_mm, result.max_residual_mm)
+        self.max_internal_force_n = max(self.max_internal_force_n, result.max_internal_force_n)
+        if plan.kind != "retreat":
+            self.way.append(Executed(plan, result.path_time_s, self.stood_at))
+            return
+        undone = self.way.pop()
+        self.stage, self.corrections, self.history, self.X_WC = undone.stage, 0, [], None

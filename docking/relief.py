@@ -1,0 +1,257 @@
+"""Stress relief: weigh, ask, one small step, weigh again, until the part is free of strain.
+
+The only relative move of single axes under load. A supervisor asks for every step; each takes at most 0.05 mm at
+0.1 mm/s, and it ends for good when a ball's force rises or the strain does not fall.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from docking import records
+from docking.errors import DockingError, ForceRose, ForeignForce, NotRelieved, PermissiveMissing, PlanStale
+from docking.kinematics import Positioners
+from docking.motion.settle import SettleSettings
+from docking.motion.weighing import PAUSE_S, weigh
+from docking.planning import PlanSettings
+from docking.planning.relief import ReliefSettings, Scales, StepRequest, Strain, Tare, Weighing, relief_plan
+from docking.ports import Journal, Motion, Operator
+from docking.state import Effect, Event
+from docking.types import Alarm, Array, MoveResult, Plan
+
+GUARD_READINGS = 4
+"""Read-backs that the guard of a running step averages: two tenths of a second, 0.02 mm at the most."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReliefRun:
+    """What a relief needs of the files and of who asks for it: `supervisor` by name, `tare` where one is known,
+    `permissives` to declare before the first step."""
+
+    positioners: Positioners
+    plan: PlanSettings
+    relief: ReliefSettings
+    settle: SettleSettings
+    period_s: float
+    permissives: tuple[str, ...]
+    supervisor: str
+    tare: Tare | None
+
+
+@dataclass
+class ReliefProgress:
+    """Where a relief stands: the strain before the first step, now, and the step that is planned."""
+
+    steps: int = 0
+    stalled: int = 0
+    lowest_n: float = float("inf")
+    first: Strain | None = None
+    strain: Strain | None = None
+    weighing: Weighing | None = None
+    plan: Plan | None = None
+    commanded_mm: Array | None = None
+    alarms: list[Alarm] = field(default_factory=list)
+
+
+class Relief:
+    """The effects of a relief run; the same interface to `docking.cell.Cell` as a docking's procedure."""
+
+    def __init__(
+        self,
+        run: ReliefRun,
+        motion: Motion,
+        journal: Journal,
+        operator: Operator,
+        clock: Callable[[], float],
+    ) -> None:
+        self._run, self._clock = run, clock
+        self.motion, self.journal, self.operator = motion, journal, operator
+        self.progress = ReliefProgress()
+        self.effects: dict[Effect, Callable[[], Awaitable[Event]]] = {
+            Effect.CONNECT: self._connect,
+            Effect.ENABLE: self._enable,
+            Effect.WEIGH: self._weigh,
+            Effect.STEP: self._step,
+        }
+
+    def alarm(self, error: DockingError) -> None:
+        """Keep an error in the journal and tell the operator."""
+        alarm = error.alarm(self._clock())
+        self.progress.alarms.append(alarm)
+        self.journal.write("alarm", records.alarm_record(alarm))
+        self.operator.notify("alarm", code=alarm.code, error=error)
+
+    async def close(self) -> None:
+        """Release the devices; what goes wrong is told."""
+        try:
+            await self.motion.close()
+        except DockingError as error:
+            self.alarm(error)
+
+    async def _connect(self) -> Event:
+        found = await self.motion.connect()
+        for identity in found:
+            self.journal.write("identity", vars(identity))
+        self.operator.notify("devices", count=len(found))
+        return Event.CONNECTED
+
+    async def _enable(self) -> Event:
+        self.progress.commanded_mm = await self.motion.enable()
+        return Event.ENABLED
+
+    async def _weigh(self) -> Event:
+        """Judge the strain that is left, and what the last step did; then have the next step asked for."""
+        run, p = self._run, self.progress
+        weighing = await weigh(self.motion, run.settle)
+        scales = Scales(run.positioners, run.plan, run.relief, weighing.position_mm)
+        strain = scales.strain(weighing, run.tare)
+        self._keep(strain, weighing)
+        self._check_foreign(strain)
+        if p.strain is not None:
+            self._check_rise(scales, p.strain, strain)
+        p.weighing, p.strain, p.first = weighing, strain, p.first or strain
+        if self._relieved(strain):
+            return Event.RELIEVED
+        if p.steps == 0:
+            await self._declare()
+        p.plan = self._next_plan(scales, strain, weighing)
+        self.operator.show(p.plan, {"passive": self._passive()})
+        facts = {"number": p.plan.plan_id, "force_n": strain.largest_n, "duration_s": p.plan.duration_s}
+        asked = await self.operator.hold_to_run(facts)
+        self.journal.write("confirm", {"plan_hash": p.plan.plan_hash, "go": asked, "supervisor": run.supervisor})
+        if asked:
+            return Event.STEP_ASKED
+        self.operator.notify("released")
+        return Event.RELEASED
+
+    def _keep(self, strain: Strain, weighing: Weighing) -> None:
+        names = self._run.positioners.names
+        self.journal.write("strain", records.strain_record(names, strain, self.motion.axes, weighing))
+        worst = names[int(np.argmax(strain.ball_n))]
+        facts = {"ball": worst, "force_n": strain.largest_n, "sigma_n": strain.sigma_n}
+        if self._run.tare is not None:
+            self.operator.notify("strain_since_tare", **facts)
+        else:
+            self.operator.notify("strain_absolute", **facts)
+
+    def _check_foreign(self, strain: Strain) -> None:
+        """What neither weight nor strain explains comes from outside: relief would pull the part against it."""
+        over = ~(strain.foreign_n <= strain.foreign_limit_n)
+        if over.any():
+            i = int(np.argmax(over))
+            value, limit = float(strain.foreign_n[i]), float(strain.foreign_limit_n[i])
+            raise ForeignForce(f"ball {self._run.positioners.names[i]}", value=value, limit=limit)
+
+    def _check_rise(self, scales: Scales, before: Strain, now: Strain) -> None:
+        """No ball may carry more than 5 % more than before the step; nor may the strain itself grow."""
+        self._refuse_rise(now.force_n - before.force_n, scales.rise_limit_n(before))
+        slack = max(self._run.relief.rise * before.largest_n, float(scales.floor_n().max()))
+        grown = now.largest_n - before.largest_n
+        if not (grown <= slack):
+            raise ForceRose("internal force", value=grown, limit=slack)
+
+    def _refuse_rise(self, rise_n: Array, limit_n: Array) -> None:
+        over = ~(rise_n <= limit_n)
+        if over.any():
+            i = int(np.argmax(over))
+            name = self._run.positioners.names[i]
+            raise ForceRose(f"ball {name}", value=float(rise_n[i]), limit=float(limit_n[i]))
+
+    def _relieved(self, strain: Strain) -> bool:
+        """Whether the relief is at its end; raises NotRelieved when it goes no further and the target is not met."""
+        p, relief = self.progress, self._run.relief
+        p.stalled = 0 if strain.largest_n < p.lowest_n else p.stalled + 1
+        p.lowest_n = min(p.lowest_n, strain.largest_n)
+        if strain.largest_n <= relief.aim * relief.target_n:
+            return True
+        if p.stalled < relief.stalled_steps:
+            return False
+        if strain.largest_n <= relief.target_n:
+            return True
+        cause = f"{p.stalled} steps in a row without any fall."
+        raise NotRelieved("part", cause, value=strain.largest_n, limit=relief.target_n)
+
+    async def _declare(self) -> None:
+        names = self._run.permissives
+        missing = await self.operator.permissives(names)
+        body = {"stage": "relief", "declared": [n for n in names if n not in missing], "missing": list(missing)}
+        self.journal.write("permissives", body)
+        if missing:
+            raise PermissiveMissing(missing[0], value="relief")
+
+    def _next_plan(self, scales: Scales, strain: Strain, weighing: Weighing) -> Plan:
+        run, p = self._run, self.progress
+        if p.commanded_mm is None:
+            raise PlanStale("relief", "the positioners are not enabled")
+        q_now = np.where(run.positioners.driven, p.commanded_mm, weighing.position_mm)
+        request = StepRequest(p.steps + 1, q_now, scales.step_mm(strain, weighing), run.period_s)
+        plan = relief_plan(request, run.positioners, run.plan, run.relief)
+        self.journal.write("plan", records.plan_record(plan))
+        return plan
+
+    def _passive(self) -> list[str]:
+        driven = self._run.positioners.driven
+        return [axis for axis, on in zip(self.motion.axes, driven, strict=True) if not on]
+
+    async def _step(self) -> Event:
+        p = self.progress
+        if p.plan is None or p.strain is None:
+            raise PlanStale("relief", "no step is planned")
+        self.journal.write("intent", records.intent_record(p.plan), durable=True)
+        await self.motion.load(p.plan)
+        result = await self._guarded(p.plan, p.strain)
+        p.steps, p.commanded_mm = p.steps + 1, result.commanded_mm
+        self.journal.write("moved", records.moved_record(p.plan, result))
+        if result.cause is not None:
+            raise result.cause
+        return Event.MOVED if result.result == "done" else Event.STOPPED
+
+    async def _guarded(self, plan: Plan, before: Strain) -> MoveResult:
+        """Run the step; it is stopped on its way, and the rise raised, as soon as a ball's force rises too far."""
+        run = self._run
+        limit_n = Scales(run.positioners, run.plan, run.relief, plan.q_mm[0]).rise_limit_n(before)
+        guard = asyncio.ensure_future(self._guard(before, limit_n))
+        try:
+            result = await self.motion.start(plan.plan_hash)
+        finally:
+            guard.cancel()
+        (outcome,) = await asyncio.gather(guard, return_exceptions=True)
+        if isinstance(outcome, ForceRose):
+            self.journal.write("moved", records.moved_record(plan, result))
+            raise outcome
+        return result
+
+    async def _guard(self, before: Strain, limit_n: Array) -> None:
+        latest: list[Array] = []
+        to_balls = np.transpose(self._run.positioners.axes_inverse, (0, 2, 1))
+        while True:
+            await asyncio.sleep(PAUSE_S)
+            latest = [*latest[1 - GUARD_READINGS :], self.motion.feedback().force_n]
+            if len(latest) < GUARD_READINGS:
+                continue
+            forces = np.einsum("kij,kj->ki", to_balls, np.mean(latest, axis=0).reshape(-1, 3))
+            try:
+                self._refuse_rise(np.linalg.norm(forces, axis=1) - before.force_n, limit_n)
+            except ForceRose:
+                self.motion.request("stop")
+                raise
+
+
+def summary_of(progress: ReliefProgress, run: ReliefRun) -> dict[str, Any]:
+    """What a relief came to, for the journal and `--json`."""
+    first, last = progress.first, progress.strain
+    return {
+        "supervisor": run.supervisor,
+        "steps": progress.steps,
+        "internal_force_before_n": None if first is None else first.largest_n,
+        "internal_force_n": None if last is None else last.largest_n,
+        "sigma_n": None if last is None else last.sigma_n,
+        "target_n": run.relief.target_n,
+        "tared": run.tare is not None,
+        "alarms": [records.alarm_record(a) for a in progress.alarms],
+    }
