@@ -151,6 +151,9 @@ class Drives:
                 self._enter(index, Stage.SWITCH_ON_DISABLED, t_s)
             return
         target = _transition(stage, word)
+        if stage is Stage.QUICK_STOP and target is Stage.OPERATION and word == before:
+            # A drive that has stopped by itself wants to be told anew, not to hear the same word once more.
+            return
         if target is Stage.QUICK_STOP:
             self.quick_stop(index, t_s)
         elif target is not None:

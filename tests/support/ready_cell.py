@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 
 from docking import records
-from docking.assemble import controller
-from docking.assemble.controller import Wires
+from docking.assemble.motion_side import local_motion
 from docking.assemble.simulated import FarEnd, make_far_end, truth_of
 from docking.config import CellFile, JobFile
 from docking.config.build import positioners_from
@@ -46,15 +45,20 @@ def production_files(name: str) -> tuple[CellFile, JobFile]:
 
 @dataclass
 class Scene:
-    """How one case is set up: cell, seed of plant and plan, how the drives behave, what is changed before bring-up."""
+    """How one case is set up: cell, seed of plant and plan, how the drives behave, the size of the move.
+
+    `cell_changes` alters the cell file, `before` is called before bring-up; `enabled`: enable the axes and load a plan.
+    """
 
     name: str = "lab-can"
     seed: int = 1
-    drives: DriveSettings = DriveSettings(sync_loss="quick-stop")
+    drives: DriveSettings = field(default_factory=lambda: DriveSettings(sync_loss="quick-stop"))
     shift_mm: float = 6.0
     turn_deg: float = 0.2
     speed_mm_s: float = 4.0
     cell_changes: Callable[[CellFile], CellFile] | None = None
+    before: Callable[[ReadyCell], None] | None = None
+    enabled: bool = True
 
 
 class ReadyCell:
@@ -93,8 +97,7 @@ class ReadyCell:
             send(frames)
 
         self.near.send = tapped  # type: ignore[method-assign]
-        wires = Wires(None, can=self.near)  # type: ignore[arg-type]
-        self.motion: Any = controller._motion(self.cell, self.positioners, wires)
+        self.motion: Any = local_motion(self.cell, self.job, self.near, None)
 
     @property
     def faults(self) -> DriveFaults:
@@ -104,8 +107,12 @@ class ReadyCell:
         return self.cell.axis_names.index(axis)
 
     async def ready(self) -> None:
-        """Bring up, enable, plan from where the axes stand, load."""
+        """Bring up, enable, plan from where the axes stand, load; only bring up where the scene says so."""
+        if self.scene.before is not None:
+            self.scene.before(self)
         await self.motion.connect()
+        if not self.scene.enabled:
+            return
         standing = await self.motion.enable()
         self.plan = self.plan_from(standing)
         await self.motion.load(self.plan)
