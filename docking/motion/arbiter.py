@@ -31,6 +31,18 @@ class Role(Enum):
 OPERATORS_OWN = frozenset({Trigger.LEASE_LOST, Trigger.PERMISSIVE_LOST, Trigger.PROTECTIVE_STOP, Trigger.TICK_LATE})
 """Causes outside drives and part: an operator may reset them, all others need a supervisor."""
 
+LASTING = frozenset(
+    {
+        Trigger.FOLLOWING_ERROR,
+        Trigger.STUCK,
+        Trigger.COUPLING,
+        Trigger.PREDICTED_FORCE,
+        Trigger.PREDICTED_WARP,
+        Trigger.AXIS_OFF,
+    }
+)
+"""Causes that last as long as the command they are judged against; enabling anew commands every axis to where it is."""
+
 FINAL = frozenset({Trigger.DEFECT})
 """Causes after which this program is not to be trusted with axes until it has been started again."""
 
@@ -76,7 +88,7 @@ class Arbiter:
             self.rejected += 1
             return self.reaction
         if finding.trigger not in REQUESTS:
-            self._raised, self._gone = True, False
+            self._raised = self._raised or finding.trigger not in LASTING
             self._note(finding)
         if asked > self.reaction:
             self._begin(asked, now_s)
@@ -99,12 +111,13 @@ class Arbiter:
         """Forget the fault. Moves nothing and resumes nothing. Raises EventRefused with the reason."""
         held = now_s - self._pressed_s < RELEASE_S
         self._pressed_s = now_s
-        reason = self._why_not(role, held)
+        reason = self.objection(role) or self._not_yet(held)
         if reason:
             raise EventRefused("reset", reason, value=f"reset by {role.value}")
         self.reaction, self.first, self.later = Reaction.NONE, None, ()
 
-    def _why_not(self, role: Role, held: bool) -> str:
+    def objection(self, role: Role) -> str:
+        """Why this role cannot reset what is kept, whatever becomes of the cause; empty where it can."""
         causes = {finding.trigger for finding in (self.first, *self.later) if finding is not None}
         enough = role is Role.SUPERVISOR or (role is Role.OPERATOR and causes <= OPERATORS_OWN)
         reasons = (
@@ -113,10 +126,13 @@ class Arbiter:
             (bool(causes & FINAL), "The program has an error: start the controller again."),
             (not enough, "This takes a supervisor."),
             (self.mode in (Mode.MOVING, Mode.STOPPING), "The axes are not at rest."),
-            (not self._gone, "The cause is still there."),
-            (held, "The key was held down: let it go, then press it again."),
         )
         return next((text for applies, text in reasons if applies), "")
+
+    def _not_yet(self, held: bool) -> str:
+        if self._raised or not self._gone:
+            return "The cause is still there."
+        return "The key was held down: let it go, then press it again." if held else ""
 
     def _note(self, finding: Finding) -> None:
         """Keep the first finding of each trigger."""

@@ -12,30 +12,61 @@ ROW_S = 1e-9
 
 
 class Playback:
-    """Reads a plan's table at path time tau, d(tau)/dt = rate in 0..1.
+    """Reads a plan's table at path time tau, d(tau)/dt = rate in 0..1. `share` is the rate at which it runs.
 
     A change of the rate takes 1.5 |change| / slew seconds along a cubic, so ds/dt is smooth and its largest slope is
     the plan's `rate_slew_per_s`. At full rate the rows themselves are the set-points; between rows, as a hold leaves
     it, the plan's own interpolation keeps the part rigid.
     """
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: Plan, share: float = 1.0) -> None:
         self.plan = plan
         self.path_time_s = 0.0
-        self.rate = 1.0
-        self._from, self._to, self._since, self._span = 1.0, 1.0, 0.0, 0.0
+        self.rate = share
+        self._share, self._held, self._straight = share, False, False
+        self._from, self._to, self._since, self._span = share, share, 0.0, 0.0
         self._q = plan.q_mm
         self._last = len(plan.q_mm) - 1
         self._period = plan.period_s
 
-    def turn_to(self, rate: float, slew_per_s: float | None = None) -> None:
-        """Begin to bring the rate to `rate` (0 hold or stop, 1 run); a fault may ask for another slew."""
-        self._from, self._to, self._since = self.rate, rate, 0.0
-        self._span = 1.5 * abs(rate - self.rate) / (slew_per_s or self.plan.rate_slew_per_s)
+    def hold(self) -> None:
+        """Come to rest; harder stops that are under way go on."""
+        self._held = True
+        if not (self._straight and self._to == 0.0):
+            self.turn_to(0.0)
+
+    def stop_straight(self, slew_per_s: float) -> None:
+        """Come to rest along a straight line of time, faster than a hold does."""
+        self._held = True
+        self._turn(0.0, self.rate / slew_per_s, straight=True)
+
+    def resume(self) -> None:
+        """Run again, at the rate last asked for."""
+        self._held = False
+        self.turn_to(self._share)
+
+    def override(self, share: float) -> None:
+        """Run at another rate, 0..1; a hold goes on."""
+        self._share = share
+        if not self._held:
+            self.turn_to(share)
 
     def wait(self) -> None:
-        """Stand where it is until the rate is turned up."""
+        """Stand where it is until it is resumed."""
+        self._held = True
         self.rate = self._from = self._to = 0.0
+
+    def turn_to(self, rate: float) -> None:
+        """Begin to bring the rate to `rate` along a cubic."""
+        self._turn(rate, self.turn_s(rate), straight=False)
+
+    def turn_s(self, rate: float) -> float:
+        """How long it takes to bring the rate to `rate`."""
+        return 1.5 * abs(rate - self.rate) / self.plan.rate_slew_per_s
+
+    def _turn(self, rate: float, span_s: float, *, straight: bool) -> None:
+        self._from, self._to, self._since, self._span = self.rate, rate, 0.0, span_s
+        self._straight = straight
 
     @property
     def at_end(self) -> bool:
@@ -49,13 +80,18 @@ class Playback:
         """Move on by `dt_s` and return the set-point (m,)."""
         if self.rate != self._to:
             self._since += dt_s
-            u = min(1.0, self._since / self._span) if self._span > 0.0 else 1.0
             before = self.rate
-            self.rate = self._to if u >= 1.0 else self._from + (self._to - self._from) * u * u * (3.0 - 2.0 * u)
+            self.rate = self._rate_now()
             self.path_time_s += 0.5 * (before + self.rate) * dt_s
         else:
             self.path_time_s += self.rate * dt_s
         return self.setpoint_at(self.path_time_s)
+
+    def _rate_now(self) -> float:
+        u = self._since / self._span if self._span > 0.0 else 1.0
+        if not (u < 1.0 - 1e-9):
+            return self._to
+        return self._from + (self._to - self._from) * (u if self._straight else u * u * (3.0 - 2.0 * u))
 
     def setpoint_at(self, path_time_s: float) -> Array:
         """The set-point (m,) at a path time; clamped to the ends of the table."""

@@ -1,4 +1,8 @@
-"""Motion over a bus that takes one set-point a cycle: the tick, at a fixed rate on absolute deadlines."""
+"""Motion over a bus that takes one set-point a cycle: the tick, at a fixed rate on absolute deadlines.
+
+Every tick: newest read-back, monitors, arbiter, path time, set-points and SYNC. So what is found changes the set-points
+of the same tick.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +13,43 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from docking.errors import AxisNotEnabled, Defect, DockingError, DriveFault, FeedbackMissing, PlanStale, TickLate
+from docking.errors import (
+    BadArgument,
+    Defect,
+    DockingError,
+    EnableFailed,
+    EventRefused,
+    LinkError,
+    LinkLost,
+    PlanStale,
+    StoppedByOperator,
+    TickLate,
+)
+from docking.motion.arbiter import Arbiter, Mode, Reaction, Role
+from docking.motion.lateness import Lateness
 from docking.motion.monitors import Watch
 from docking.motion.playback import Playback
 from docking.motion.recorder import Recorder
-from docking.motion.triggers import Finding
+from docking.motion.stops import PlannedStop, planned_stop
+from docking.motion.triggers import Finding, Trigger
 from docking.ports import StreamedPositioners
 from docking.types import Array, Feedback, Identity, MoveResult, Plan, readonly
 
 START_TOLERANCE_MM = 0.01
-SHORTEST_CYCLE = 0.9
 TRACE_PERIOD_S = 0.1
+STOP_CYCLES = 2
+"""Cycles by which a stop on the path may outlast itself."""
+QUICK_STOP_S = 0.1
+"""By which a quick stop may outlast its ramp until all axes are seen at rest."""
+BRAKE_S = 2.0
+REST_MM = 0.002
+"""An axis that moves no more between two cycles stands..."""
+REST_CYCLES = 3
+"""...when it did so for these cycles, reporting at most..."""
+REST_AGE = 2
+"""...so many cycles late."""
+RESET_S = 0.3
+"""How long nothing may be found again after what the nodes reported has been forgotten: three heartbeats."""
 
 
 @dataclass
@@ -28,82 +58,87 @@ class _Move:
 
     playback: Playback
     recorder: Recorder
+    stop: PlannedStop
     done: asyncio.Future[MoveResult]
     over: asyncio.Event
-    stop_asked: bool = False
 
 
 class StreamedMotion:
     """The `Motion` port over `StreamedPositioners`. Owns the tick from `enable` to `close`.
 
-    A tick that comes more than `late_cycles` late stops the axes.
+    A tick that comes more than `late_cycles` late stops the axes. `arbiter` decides every stop; `lateness` counts how
+    late the ticks came.
     """
 
     def __init__(self, positioners: StreamedPositioners, watch: Watch, late_cycles: float) -> None:
         self._bus, self._watch = positioners, watch
         self.axes = positioners.axes
+        self.lateness = Lateness()
+        self.arbiter = Arbiter(self._allowed_s)
         self._cycle_s = positioners.cycle_s
         self._late_limit_s = late_cycles * self._cycle_s
         self._setpoint: Array = np.zeros(len(self.axes))
-        self._history: deque[Array] = deque(maxlen=3)
+        self._history: deque[Array] = deque(maxlen=2)
         self._feedback: Feedback | None = None
-        self._loaded: Playback | None = None
+        self._loaded: tuple[Playback, PlannedStop] | None = None
         self._move: _Move | None = None
-        self._cause: DockingError | None = None
         self._early: list[str] = []
-        self._left_alone = False
+        self._share = 1.0
+        self._applied = Reaction.NONE
+        self._braking: asyncio.Task[None] | None = None
+        self._braked = False
+        self._still = 0
+        self._quick_stop_s = QUICK_STOP_S
         self._timer: asyncio.Handle | None = None
-        self._deadline_s = 0.0
-        self._judged: Feedback | None = None
+        self._deadline_s = self._skipped_s = 0.0
 
+    # the port ----------------------------------------------------------------------------------------------------
     async def connect(self) -> tuple[Identity, ...]:
         return await self._bus.bring_up()
 
     async def enable(self) -> Array:
-        if self._move is not None:
-            raise PlanStale("motion", "a move is running")
+        """Raises the fault that is kept: `reset` comes first."""
+        self._refuse()
         self._end_ticks()
+        self.arbiter.enter(Mode.OFF)
         feedback = await self._bus.enable()
         self._setpoint = readonly(feedback.position_mm)
-        self._history.extend([self._setpoint] * 3)
-        self._feedback, self._judged, self._loaded, self._cause = feedback, None, None, None
+        self._history.extend([self._setpoint] * 2)
+        self._feedback, self._loaded = feedback, None
         self._early.clear()
-        self._left_alone = False
         self._watch.watch_about(self._setpoint)
+        self.arbiter.enter(Mode.STANDING)
         loop = asyncio.get_running_loop()
         self._deadline_s = loop.time()
         self._timer = loop.call_soon(self._tick)
         return self._setpoint
 
     async def load(self, plan: Plan) -> None:
-        if self._cause is not None:
-            raise self._cause
-        if self._move is not None:
-            raise PlanStale(plan.stage, "a move is running")
+        """Take a plan, and set the drives' own ramps for it. Nothing moves."""
+        self._refuse()
         gap = float(np.max(np.abs(plan.q_mm[0] - self._setpoint)[self._watch.driven]))
         if not (gap <= START_TOLERANCE_MM):
             raise PlanStale(plan.stage, f"it starts {gap:.4f} mm from where the axes are commanded")
         self._require_enabled()
-        self._watch.watch_about(plan.q_mm[0])
-        self._loaded = Playback(plan)
-
-    def _require_enabled(self) -> None:
-        off = self._watch.power(self.feedback())
-        if off is not None:
-            raise off
+        stop = planned_stop(plan, self._bus.a_quick_mm_s2, self._cycle_s)
+        self._loaded = None
+        await self._bus.arm_stops(stop.peak_mm_s, stop.t_stop_s)
+        self._refuse()
+        self._watch.watch_about(plan.q_mm[0], relief=plan.kind == "relief")
+        self._quick_stop_s = stop.t_stop_s + QUICK_STOP_S
+        self._loaded = Playback(plan, self._share), stop
 
     async def start(self, plan_hash: str) -> MoveResult:
-        if self._cause is not None:
-            raise self._cause
-        if self._move is not None:
-            raise PlanStale("motion", "a move is running")
-        playback, self._loaded = self._loaded, None
-        if playback is None or playback.plan.plan_hash != plan_hash:
+        self._refuse()
+        loaded, self._loaded = self._loaded, None
+        if loaded is None or loaded[0].plan.plan_hash != plan_hash:
             raise PlanStale("motion", "this plan is not loaded")
         self._require_enabled()
+        playback, stop = loaded
         recorder = Recorder(self._watch, max(1, round(TRACE_PERIOD_S / self._cycle_s)))
         done: asyncio.Future[MoveResult] = asyncio.get_running_loop().create_future()
-        self._move = _Move(playback, recorder, done, asyncio.Event())
+        self.arbiter.enter(Mode.MOVING)
+        self._move = _Move(playback, recorder, stop, done, asyncio.Event())
         if self._early:
             playback.wait()
         for verb in self._early:
@@ -118,24 +153,48 @@ class StreamedMotion:
             self._early.clear()
 
     def request(self, verb: str) -> None:
+        """`hold`, `resume` or `stop`, all on the path. Never waits."""
         if self._move is None:
             # A hold that comes before the first set-point counts from the first set-point on.
             self._early.append(verb)
         else:
             self._obey(self._move, verb)
 
-    def _obey(self, move: _Move, verb: str) -> None:
-        if verb == "resume":
-            if not move.stop_asked and self._cause is None:
-                move.playback.turn_to(1.0)
-            return
-        move.stop_asked = move.stop_asked or verb == "stop"
-        if self._cause is None:
-            move.playback.turn_to(0.0)
+    def override(self, percent: float) -> None:
+        """Run this move and later ones at `percent` (0..100) of their speed, on the same path. A hold goes on.
+
+        Raises BadArgument.
+        """
+        if not (0.0 <= percent <= 100.0):
+            raise BadArgument("speed override", value=percent, limit="0 to 100 %")
+        self._share = percent / 100.0
+        move = self._move
+        if move is not None and self.arbiter.mode is Mode.MOVING:
+            move.playback.override(self._share)
+
+    def report(self, finding: Finding) -> None:
+        """Something outside the axes asks for a reaction: judged and latched as what the monitors find."""
+        self._raise(finding.trigger, finding.error)
+
+    async def reset(self, role: str) -> None:
+        """Forget the fault that is kept, on a person's order; then the axes have to be enabled again. Moves nothing.
+
+        Drives in fault are reset, too. Raises EventRefused with the reason, EnableFailed, LinkError.
+        """
+        asked = Role(role)
+        objection = self.arbiter.objection(asked)
+        if objection:
+            raise EventRefused("reset", objection, value=f"reset by {role}")
+        await self._bus.reset_faults()
+        await asyncio.sleep(RESET_S)
+        self.arbiter.reset(asked, self._clock_s())
+        self._applied = Reaction.NONE
+        self.arbiter.enter(Mode.OFF)
 
     def feedback(self) -> Feedback:
-        if self._cause is not None:
-            raise self._cause
+        """The newest read-back. Raises the fault that is kept."""
+        if self.arbiter.first is not None:
+            raise self.arbiter.first.error
         if self._feedback is None:
             raise PlanStale("motion", "the positioners are not enabled")
         return self._feedback
@@ -146,110 +205,207 @@ class StreamedMotion:
             self.request("stop")
             await over.wait()
         self._end_ticks()
+        if self._braking is not None:
+            self._braking.cancel()
+            await asyncio.gather(self._braking, return_exceptions=True)
         await self._bus.close()
+
+    def _refuse(self) -> None:
+        """Raise what forbids that anything begins."""
+        if self.arbiter.first is not None:
+            raise self.arbiter.first.error
+        if self._move is not None:
+            raise PlanStale("motion", "a move is running")
+
+    def _require_enabled(self) -> None:
+        off = self._watch.power(self.feedback())
+        if off is not None:
+            raise off
+        if self.arbiter.mode is not Mode.STANDING:
+            raise PlanStale("motion", "the axes have to be enabled again")
+
+    def _obey(self, move: _Move, verb: str) -> None:
+        if verb == "stop":
+            self._raise(Trigger.OPERATOR_STOP, StoppedByOperator("motion"))
+        elif self.arbiter.mode is not Mode.MOVING:
+            return
+        elif verb == "resume":
+            move.playback.resume()
+        else:
+            move.playback.hold()
 
     def _end_ticks(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
 
+    # the tick ----------------------------------------------------------------------------------------------------
     def _tick(self) -> None:
         self._timer = None
-        move = self._move
         try:
-            self._cycle(move)
-        except DockingError as error:
-            self._give_up(error, move)
+            self._cycle()
         except Exception as error:
-            # A defect: no more set-points. Whoever waits for the move learns why, and so does everyone who asks later.
-            self._cause = self._cause or Defect("motion", f"{type(error).__name__}: {error}")
-            if move is not None:
-                self._end(move)
-                if not move.done.done():
-                    move.done.set_exception(error)
-            self._bus.quick_stop()
+            # No more set-points. Whoever waits for the move learns why, and so does everyone who asks later.
+            move = self._move
+            self._raise(Trigger.DEFECT, _defect(error))
+            self._end()
+            if move is not None and not move.done.done():
+                move.done.set_exception(error)
             raise
 
-    def _cycle(self, move: _Move | None) -> None:
-        loop = asyncio.get_running_loop()
-        now = loop.time()
-        if move is not None:
-            self._setpoint = move.playback.advance(self._cycle_s)
-        self._history.append(self._setpoint)
-        feedback = self._bus.exchange(self._setpoint)
+    def _cycle(self) -> None:
+        now_s = asyncio.get_running_loop().time()
+        late_s = now_s - self._deadline_s
+        self.lateness.add(late_s)
+        before, feedback = self._feedback, self._bus.latest()
         self._feedback = feedback
-        cause = self._judge(feedback, move) or self._lateness(now - self._deadline_s)
-        if cause is not None:
-            self._trip(cause, move)
-        if move is not None:
-            self._follow(move, feedback)
+        applied = self._applied
+        self._judge(feedback)
+        if not (late_s <= self._late_limit_s):
+            self._raise(Trigger.TICK_LATE, TickLate("motion", value=late_s, limit=self._late_limit_s))
+        stopping = self.arbiter.mode is Mode.STOPPING
+        self._react(self.arbiter.poll(self._clock_s(), stopping and self._at_rest(before, feedback)))
+        if self._applied is not Reaction.HW:
+            self._go_on(feedback, quick=self._applied >= Reaction.SQS > applied)
+        if self._applied is Reaction.HW:
+            self._finish("fault")
+            return
         # Missed deadlines are skipped, never made up for in a burst; the next is at least half a cycle away.
-        missed = max(0, math.floor((now - self._deadline_s) / self._cycle_s + 0.5))
+        missed = max(0, math.floor(late_s / self._cycle_s + 0.5))
+        self._skipped_s += missed * self._cycle_s
         self._deadline_s += (1 + missed) * self._cycle_s
-        self._timer = loop.call_at(self._deadline_s, self._tick)
+        self._timer = asyncio.get_running_loop().call_at(self._deadline_s, self._tick)
 
-    def _give_up(self, error: DockingError, move: _Move | None) -> None:
-        """The bus takes no set-points any more: the drives stop by themselves, the ticks end."""
-        self._cause = self._cause or error
-        self._bus.quick_stop()
+    def _go_on(self, feedback: Feedback, *, quick: bool) -> None:
+        """Path time, set-points and SYNC; `quick` says that the quick stop has just sent this cycle's frames."""
+        move = self._move
         if move is not None:
-            self._finish(move, "fault")
+            move.recorder.add(feedback, move.playback.path_time_s)
+            if self.arbiter.mode in (Mode.STANDING, Mode.OFF):
+                self._end_stop(move, feedback)
+            elif self._applied < Reaction.SQS:
+                self._setpoint = move.playback.advance(self._cycle_s)
+        self._history.append(self._setpoint)
+        if not quick:
+            self._send()
+        if self._move is not None and self.arbiter.mode is Mode.MOVING and self._move.playback.at_end:
+            self._finish("done")
 
-    def _judge(self, feedback: Feedback, move: _Move | None) -> DockingError | None:
-        if move is None:
-            before, self._judged = self._judged, feedback
-            if before is not None and _same(before, feedback) and self._history[0] is self._setpoint:
-                return None
-            return _error_of(self._watch.evaluate(feedback, self._history[0], 0.0, moving=False))
+    def _send(self) -> None:
+        try:
+            self._bus.send(self._setpoint)
+        except LinkLost as error:
+            self._raise(Trigger.LINK_LOST, error)
+        except DockingError as error:
+            # Set-points that a drive cannot take: nothing was sent, so the drives have to stop by themselves.
+            self._raise(Trigger.DEFECT, error)
+
+    def _end_stop(self, move: _Move, feedback: Feedback) -> None:
+        """The axes have come to rest after a stop."""
+        if self._applied >= Reaction.SQS:
+            self._setpoint = readonly(feedback.position_mm)
+        if self.arbiter.latched:
+            self._finish("fault")
+        else:
+            self._finish("done" if move.playback.at_end else "stopped")
+        self._applied = self.arbiter.reaction
+
+    # monitors and reactions --------------------------------------------------------------------------------------
+    def _judge(self, feedback: Feedback) -> None:
+        mode, move = self.arbiter.mode, self._move
+        if mode is Mode.OFF:
+            return
         # A read-back belongs to the set-point of two cycles ago: one cycle on the bus, one until the drive applies it.
-        speed = move.playback.speed_at(move.playback.path_time_s)
-        return _error_of(self._watch.evaluate(feedback, self._history[0], speed, moving=True))
+        speed = 0.0 if move is None else move.playback.speed_at(move.playback.path_time_s)
+        finding = self._watch.evaluate(
+            feedback,
+            self._history[0],
+            speed,
+            moving=mode is not Mode.STANDING,
+            may_stop=self._applied >= Reaction.SQS,
+        )
+        if finding is None:
+            return
+        if finding.trigger is Trigger.AXIS_OFF and mode is Mode.STANDING and self._applied >= Reaction.SQS:
+            # What the stop itself has left behind: enabling brings the axes back.
+            return
+        self._react(self.arbiter.raise_(finding, self._clock_s()))
 
-    def _lateness(self, late_s: float) -> DockingError | None:
-        limit = self._late_limit_s
-        return TickLate("motion", value=late_s, limit=limit) if not (late_s <= limit) else None
+    def _raise(self, trigger: Trigger, error: DockingError) -> None:
+        self._react(self.arbiter.raise_(Finding(trigger, error), self._clock_s()))
 
-    def _trip(self, cause: DockingError, move: _Move | None) -> None:
-        """Keep the first cause and stop on the path; axes that cannot be led there stop by themselves, now or later."""
-        if isinstance(cause, DriveFault | FeedbackMissing | AxisNotEnabled) and not self._left_alone:
-            self._left_alone = True
+    def _clock_s(self) -> float:
+        """Time for the arbiter: cycles that did not take place lengthen a stop without making it wrong."""
+        return asyncio.get_running_loop().time() - self._skipped_s
+
+    def _allowed_s(self, reaction: Reaction) -> float:
+        """How long a reaction that begins now may take."""
+        if reaction is Reaction.SBT:
+            return BRAKE_S
+        if reaction >= Reaction.SQS or self._move is None:
+            return self._quick_stop_s
+        playback = self._move.playback
+        led_s = playback.turn_s(0.0) if reaction is Reaction.PPS else playback.rate / self._move.stop.fast_slew_per_s
+        return led_s + (STOP_CYCLES + 1) * self._cycle_s
+
+    def _react(self, reaction: Reaction) -> None:
+        """Begin the reaction in force, unless it has begun."""
+        if not (reaction > self._applied):
+            return
+        self._applied = reaction
+        if reaction is Reaction.HW:
+            self._bus.go_silent()
+        elif reaction >= Reaction.SQS:
+            self._still = 0
             self._bus.quick_stop()
-        if self._cause is not None:
-            return
-        self._cause = cause
-        if move is not None:
-            move.playback.turn_to(0.0, self._watch.quick_slew_per_s(move.playback.plan))
+            if reaction is Reaction.SBT:
+                self._braked = False
+                self._braking = asyncio.get_running_loop().create_task(self._brake())
+        elif self._move is not None and reaction is Reaction.FAST_PPS:
+            self._move.playback.stop_straight(self._move.stop.fast_slew_per_s)
+        elif self._move is not None and reaction is Reaction.PPS:
+            self._move.playback.hold()
 
-    def _follow(self, move: _Move, feedback: Feedback) -> None:
-        playback = move.playback
-        move.recorder.add(feedback, playback.path_time_s)
-        stopped = playback.standing and (move.stop_asked or self._cause is not None)
-        if not (playback.at_end or stopped):
-            return
-        self._finish(move, "fault" if self._cause else "stopped" if stopped else "done")
+    async def _brake(self) -> None:
+        try:
+            await self._bus.brake()
+            self._braked = True
+        except (EnableFailed, LinkError) as error:
+            # It stays unconfirmed, so that the arbiter opens the hardware chain when its time is over.
+            self._raise(Trigger.AXIS_OFF, error)
 
-    def _finish(self, move: _Move, outcome: str) -> None:
-        result = move.recorder.result(outcome, move.playback.path_time_s, self._setpoint, self._cause)
-        self._end(move)
+    def _at_rest(self, before: Feedback | None, feedback: Feedback) -> bool:
+        """Whether the reaction in force has reached its end."""
+        if self._applied is Reaction.SBT:
+            return self._braked
+        if self._applied is Reaction.SQS:
+            moved = np.inf if before is None else np.abs(feedback.position_mm - before.position_mm).max()
+            resting = moved <= REST_MM and feedback.age_cycles.max() <= REST_AGE
+            self._still = self._still + 1 if resting else 0
+            return self._still >= REST_CYCLES
+        return self._move is None or self._move.playback.standing or self._move.playback.at_end
+
+    def _finish(self, outcome: str) -> None:
+        """End the move, if there is one."""
+        move = self._move
+        if move is None:
+            return
+        cause = self.arbiter.first.error if self.arbiter.first is not None else None
+        result = move.recorder.result(outcome, move.playback.path_time_s, self._setpoint, cause)
+        self._end()
         if not move.done.done():
             move.done.set_result(result)
 
-    def _end(self, move: _Move) -> None:
-        self._move = None
-        move.over.set()
+    def _end(self) -> None:
+        move, self._move = self._move, None
+        if self.arbiter.mode is Mode.MOVING:
+            self.arbiter.enter(Mode.STANDING)
+        if move is not None:
+            move.over.set()
 
 
-def _error_of(finding: Finding | None) -> DockingError | None:
-    return None if finding is None else finding.error
+def _defect(error: Exception) -> DockingError:
+    defect = Defect("motion", f"{type(error).__name__}: {error}")
+    defect.__cause__ = error
+    return defect
 
-
-def _same(before: Feedback, now: Feedback) -> bool:
-    """True when a driver passed the same values on: at rest, what was judged a cycle ago needs no second judgement."""
-    return (
-        now.position_mm is before.position_mm
-        and now.following_error_mm is before.following_error_mm
-        and now.force_n is before.force_n
-        and now.states is before.states
-        and now.age_cycles is before.age_cycles
-        and now.fault is before.fault
-    )

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from docking.errors import AxisLimitExceeded
 from docking.ports import CanFrame
-from docking.types import Array, AxisState, Feedback, readonly
+from docking.types import Array, AxisState, FaultKind, Feedback, readonly
 from drivers.canopen import cia402, codec
 from drivers.canopen.cia402 import DriveState, Goal
+from drivers.canopen.followers import ForceImage
 from drivers.canopen.nodes import AxisNode
 from drivers.canopen.watch import NodeWatch
 from drivers.maps.objects import ObjectMap
@@ -27,17 +28,21 @@ _NAN = float("nan")
 class CyclicImage:
     """What is sent each cycle and what came back; the only owner of the controlwords.
 
-    Driven axes have a set-point frame, passive axes only report. Arrays are in the cell's axis order, (m,).
-    `cycles` counts the SYNCs sent.
+    Driven axes have a set-point frame, those that hold a force a frame of their own (`forces`), passive axes only
+    report. `driven` are the axes that hold a position, `powered` these and those that hold a force. Arrays are in the
+    cell's axis order, (m,). `cycles` counts the SYNCs sent.
     """
 
-    def __init__(self, nodes: tuple[AxisNode, ...], omap: ObjectMap, counts_per_mm: float) -> None:
+    def __init__(self, nodes: tuple[AxisNode, ...], omap: ObjectMap, counts_per_mm: float, cycle_s: float) -> None:
         self.nodes = nodes
+        self.forces = ForceImage(nodes, omap, cycle_s)
         self.driven: NDArray[np.intp] = np.array([n.index for n in nodes if n.driven], dtype=np.intp)
+        self.powered = [*self.driven.tolist(), *self.forces.indices]
         self.cycles = 0
         self._map, self._counts_per_mm = omap, counts_per_mm
         self._follows = 1 << omap.status_bits["follows"]
         self._brake = 1 << omap.status_bits["brake_closed"]
+        self._limit = 1 << omap.status_bits["at_limit"]
         self._start_output(omap)
         self._start_input()
 
@@ -47,8 +52,9 @@ class CyclicImage:
         self._image["mode"] = omap.mode
         self._target = self._image["target"]
         cob = omap.pdos["set_points"].cob
-        self.set_point_cobs = [cob + self.nodes[int(i)].node for i in self.driven]
+        self.set_point_cobs = [*(cob + self.nodes[int(i)].node for i in self.driven), *self.forces.cobs]
         self._frames: list[CanFrame] = []
+        self._force_frames: list[CanFrame] = []
         self._setpoint_bytes = b""
         self._dirty = True
 
@@ -72,22 +78,26 @@ class CyclicImage:
         self._words: list[int] = [0] * count
         self._states: tuple[DriveState, ...] = (DriveState.UNKNOWN,) * count
         self._axis_states: tuple[AxisState, ...] = (AxisState.UNKNOWN,) * count
-        self._in_fault: int | None = None
+        self._in_fault: tuple[int, ...] = ()
+        self._at_limit: NDArray[np.bool_] | None = None
         self._enabled = np.zeros(len(self.driven), np.bool_)
         self._position = self._error = self._ages = self._fresh = readonly(np.zeros(count))
         self._counts: NDArray[np.int32] = np.zeros(count, np.int32)
 
     # what is sent ------------------------------------------------------------------------------------------------
     def command(self, index: int, controlword: int) -> None:
-        """Set the controlword of one driven axis."""
-        row = self._slots[index]
-        if int(self._image["controlword"][row]) != controlword:
+        """Set the controlword of one powered axis."""
+        row = self._slots.get(index)
+        if row is None:
+            self.forces.command(index, controlword)
+        elif int(self._image["controlword"][row]) != controlword:
             self._image["controlword"][row] = controlword
             self._dirty = True
 
     def command_all(self, controlword: int) -> None:
-        """Set the controlword of every driven axis."""
+        """Set the controlword of every powered axis."""
         self._image["controlword"] = controlword
+        self.forces.command_all(controlword)
         self._dirty = True
 
     def aim_mm(self, setpoint_mm: Array) -> None:
@@ -127,13 +137,29 @@ class CyclicImage:
 
     def frames(self) -> list[CanFrame]:
         """The frames of this cycle, SYNC last; the list is the caller's to extend only by copying."""
+        if self.forces.indices:
+            self._lead_forces()
         if self._dirty:
             raw = self._image.tobytes()
+            cobs = self.set_point_cobs[: len(self.driven)]
             cuts = range(0, len(raw), _FRAME)
-            self._frames = [(cob, raw[i : i + _FRAME]) for cob, i in zip(self.set_point_cobs, cuts, strict=True)]
-            self._frames.append(codec.SYNC)
+            self._frames = [(cob, raw[i : i + _FRAME]) for cob, i in zip(cobs, cuts, strict=True)]
+            self._frames += [*self._force_frames, codec.SYNC]
             self._dirty = False
         return self._frames
+
+    def _lead_forces(self) -> None:
+        """One cycle on for the axes that hold a force."""
+        for index in self.forces.indices:
+            self.forces.lead(index, self.force_n(index), self.follows(index))
+        frames = self.forces.frames()
+        if frames != self._force_frames:
+            self._force_frames, self._dirty = frames, True
+
+    def force_n(self, index: int) -> float:
+        """What the load cell of one axis reads, N; NaN where that is not known."""
+        self._forget_old_forces()
+        return float(self._force[index])
 
     # what came back ----------------------------------------------------------------------------------------------
     def take_batch(self, batch: list[CanFrame]) -> Sequence[CanFrame]:
@@ -207,6 +233,7 @@ class CyclicImage:
         self._joined = self._head = None
         if index in self._slots:
             self._target[self._slots[index]] = position_counts
+        if index in self.powered:
             # A dead controller may have left the axis under torque: the first controlword must not take it away.
             state, closed = cia402.decode(statusword), bool(statusword & self._brake)
             self.command(index, cia402.next_controlword(state, Goal.DISABLED, closed))
@@ -259,8 +286,9 @@ class CyclicImage:
             self._words = words
             self._states = tuple(cia402.decode(word) for word in words)
             self._axis_states = tuple(cia402.AXIS_STATES[state] for state in self._states)
-            faults = [i for i, state in enumerate(self._axis_states) if state is AxisState.FAULT]
-            self._in_fault = faults[0] if faults else None
+            self._in_fault = tuple(i for i, state in enumerate(self._axis_states) if state is AxisState.FAULT)
+            limited = [bool(word & self._limit) for word in words]
+            self._at_limit = np.array(limited) if any(limited) else None
             self._enabled = np.array([self._axis_states[i] is AxisState.ENABLED for i in self.driven])
 
     def feedback(self, t_s: float, watch: NodeWatch) -> Feedback:
@@ -270,7 +298,10 @@ class CyclicImage:
         ages = self._fresh
         if min(self._seen) != self.cycles:
             ages = self.cycles - np.array(self._seen, dtype=np.float64)
-        fault = watch.first
-        if fault is None and self._in_fault is not None:
-            fault = watch.fault_of(self._in_fault)
-        return Feedback(t_s, self._position, self._error, self._force, self._axis_states, ages, _NAN, fault)
+        if watch.first is None and not self._in_fault:
+            fault, kind = None, FaultKind.DRIVE_FAULT
+        else:
+            fault, kind = watch.verdict(self._in_fault)
+        return Feedback(
+            t_s, self._position, self._error, self._force, self._axis_states, ages, _NAN, fault, self._at_limit, kind
+        )

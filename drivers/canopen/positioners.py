@@ -11,26 +11,28 @@ import numpy as np
 from docking.config.cell import CellFile
 from docking.errors import DeviceSilent, EnableFailed, LinkLost, ReadBackMismatch
 from docking.ports import CanFrame, CanLink
-from docking.types import Array, Feedback, Identity
+from docking.types import Array, Feedback, Identity, readonly
 from drivers.canopen import cia402, codec
 from drivers.canopen.bring_up import NodeBringUp, quantities
 from drivers.canopen.cia402 import DriveState
 from drivers.canopen.cyclic import CyclicImage
 from drivers.canopen.nodes import axis_nodes, can_bus_of
 from drivers.canopen.power import PowerGroup
+from drivers.canopen.ramps import QuickStopRamps
 from drivers.canopen.watch import NodeWatch
 from drivers.maps.objects import load_object_map
 
 _START_UP_S = 1.0
-_RESET_S = 0.5
+_EDGE_CYCLES = 3
+"""SYNCs for a drive to see an edge in its controlword."""
 
 
 class CanopenPositioners:
     """The `StreamedPositioners` port over CiA 402 drives.
 
-    Someone must send SYNC every `cycle_s` from bring-up to closing. Until the first `exchange` after enabling, and
-    while enabling or disabling, this class does so itself; then the caller's tick does, and its end is the end of SYNC
-    and of the heartbeat that the drives watch.
+    Someone must send SYNC every `cycle_s` from bring-up to closing. Until the first `send` after enabling, and while
+    enabling or closing, this class does so itself; then the caller's tick does, and its end is the end of SYNC and of
+    the heartbeat that the drives watch.
     """
 
     def __init__(self, cell: CellFile, link: CanLink) -> None:
@@ -39,17 +41,20 @@ class CanopenPositioners:
         self._nodes = axis_nodes(cell, self._map.host_node)
         self.axes: tuple[str, ...] = cell.axis_names
         self.cycle_s: float = self._bus.cycle_s
-        self._image = CyclicImage(self._nodes, self._map, self._bus.counts_per_mm)
+        self.a_quick_mm_s2: Array = readonly([node.axis.a_quick_mm_s2 for node in self._nodes])
+        self._image = CyclicImage(self._nodes, self._map, self._bus.counts_per_mm, self._bus.cycle_s)
         self._watch = NodeWatch(self._nodes, self._map, self._bus.heartbeat_s)
         self._power = PowerGroup(self._image, self._step, self._cause_of)
         self._setups = tuple(NodeBringUp(node, self._map, link.send) for node in self._nodes)
+        ramp = self._map.objects["quick_stop_deceleration"]
+        self._ramps = QuickStopRamps(self._setups, ramp, self.a_quick_mm_s2, self._bus.counts_per_mm)
         self._heartbeat = codec.heartbeat(self._map.host_node)
         self._loop: asyncio.AbstractEventLoop
         self._handlers = self._routes()
         self._keeper: asyncio.TimerHandle | None = None
         self._keeper_due_s = self._sync_s = self._beat_due_s = 0.0
         self._lost: str | None = None
-        self._open = self._live = self._first = self._sequencing = self._stopping = False
+        self._open = self._live = self._first = self._sequencing = self._stopping = self._silent = False
 
     # the port ----------------------------------------------------------------------------------------------------
     async def bring_up(self) -> tuple[Identity, ...]:
@@ -78,12 +83,14 @@ class CanopenPositioners:
         """
         if not self._open:
             raise EnableFailed(self._bus.channel, "the bus has not been brought up", value="bus closed")
+        if self._silent:
+            raise EnableFailed(self._bus.channel, "the hardware chain was opened: start again", value="silent")
         self._live, self._stopping, self._sequencing = False, False, True
         self._watch.rearm()
         try:
             self._keep()
             await self._all_reporting()
-            await self._power.enable(self._limits.following_error_rest_mm)
+            await self._power.enable(self._limits.following_error_rest_mm, self._limits.reaction_min_fraction)
             self._live = self._first = True
         except LinkLost as error:
             raise EnableFailed(error.where, error.cause, value="link lost") from error
@@ -91,62 +98,91 @@ class CanopenPositioners:
             self._sequencing = False
         return self._image.feedback(self._sync_s, self._watch)
 
-    def exchange(self, setpoint_mm: Array) -> Feedback:
-        """Send one set-point (m,) per axis and the common SYNC; return the newest read-back. Passive ones are ignored.
+    def latest(self) -> Feedback:
+        """The newest read-back."""
+        return self._image.feedback(self._sync_s, self._watch)
+
+    def send(self, setpoint_mm: Array) -> None:
+        """Send one set-point (m,) per axis and the common SYNC. Passive entries are ignored.
 
         Raises LinkLost, AxisLimitExceeded, and ReadBackMismatch when the first set-point after enabling is not where
         the axes stand; nothing is sent then.
         """
-        if self._lost is not None or not self._open:
-            raise LinkLost(self._bus.channel, self._lost or "the bus is not open")
+        self._require_link()
         if self._keeper is not None and not self._sequencing:
             self._keeper.cancel()
             self._keeper = None
-        feedback = self._image.feedback(self._sync_s, self._watch)
         if self._live:
             self._image.aim_mm(setpoint_mm)
             if self._first:
                 self._check_first()
         self._cycle()
-        return feedback
+
+    async def arm_stops(self, peak_mm_s: Array, t_stop_s: float) -> None:
+        """Set the drives' own quick-stop ramps for a move with peak speeds (m,); call at standstill.
+
+        Raises AxisLimitExceeded, ReadBackMismatch, DeviceSilent, DeviceRefused, LinkLost: each names the axis.
+        """
+        self._require_link()
+        await self._ramps.arm(peak_mm_s, t_stop_s)
+
+    async def restore_stops(self) -> None:
+        """Write the full quick-stop decelerations back. Raises as `arm_stops`."""
+        self._require_link()
+        await self._ramps.restore()
 
     def quick_stop(self) -> None:
         """Tell every drive to stop by itself at once; it stays so until `enable`. Never waits, never raises."""
         self._live, self._stopping = False, True
         self._image.command_all(cia402.QUICK_STOP)
-        if self._open and self._lost is None:
+        if self._open and not self._silent and self._lost is None:
             self._cycle()
 
+    async def brake(self) -> None:
+        """At standstill: close all brakes, then take the torque where they report closed; `send` goes on meanwhile.
+
+        Raises EnableFailed naming an axis whose brake does not report closed; that axis keeps its torque.
+        """
+        self._live = self._stopping = False
+        await self._power.disable()
+
+    def go_silent(self) -> None:
+        """Send nothing any more, neither SYNC nor heartbeat, not even on closing. Never waits, never raises."""
+        self._live, self._silent = False, True
+        if self._keeper is not None:
+            self._keeper.cancel()
+            self._keeper = None
+
     async def reset_faults(self) -> None:
-        """Reset drives that are in fault, on an operator's order only; the axes stay disabled. Raises EnableFailed."""
-        faulted = [int(i) for i in self._image.driven if self._image.state(int(i)) is DriveState.FAULT]
-        self._live, self._sequencing = False, True
-        try:
-            self._keep()
-            for word in (cia402.DISABLE_VOLTAGE, cia402.FAULT_RESET, cia402.DISABLE_VOLTAGE):
-                for index in faulted:
-                    self._image.command(index, word)
-                for _ in range(3):
-                    await self._step()
-        finally:
-            self._sequencing = False
+        """Reset drives that are in fault and forget what the nodes reported; `send` goes on meanwhile.
+
+        On a person's order only. The axes stay as they are, those in fault disabled. Raises EnableFailed, LinkLost.
+        """
+        faulted = [i for i in self._image.powered if self._image.state(i) is DriveState.FAULT]
+        self._live = self._stopping = False
+        for word in (cia402.DISABLE_VOLTAGE, cia402.FAULT_RESET, cia402.DISABLE_VOLTAGE) if faulted else ():
+            for index in faulted:
+                self._image.command(index, word)
+            for _ in range(_EDGE_CYCLES):
+                await self._step()
         for index in faulted:
             if self._image.state(index) is DriveState.FAULT:
                 raise EnableFailed(self._nodes[index].name, self._cause_of(index), value=DriveState.FAULT.value)
         self._watch.rearm()
 
     async def close(self) -> None:
-        """Disable the axes, brakes confirmed first, then release the bus.
+        """Disable the axes, brakes confirmed first, restore their quick-stop ramps, then release the bus.
 
         Raises EnableFailed where a brake is not reported closed; that axis keeps its torque, and its drive stops and
-        holds by itself when it misses the heartbeat.
+        holds by itself when it misses the heartbeat. Raises as `restore_stops` where a ramp could not be restored.
         """
         if not self._open:
             return
         try:
-            if self._lost is None and self._image.cycles:
+            if self._lost is None and not self._silent and self._image.cycles:
                 self._keep()
                 await self._settle_power()
+                await self._ramps.restore()
                 self._watch.disarm()
                 self._send([codec.nmt(codec.NMT_PRE_OPERATIONAL, node.node) for node in self._nodes])
         except LinkLost:
@@ -194,7 +230,7 @@ class CanopenPositioners:
     def _refuse_powered_passive(self) -> None:
         for node in self._nodes:
             state = self._image.state(node.index)
-            if not node.driven and cia402.AXIS_STATES[state].value in ("enabled", "stopping"):
+            if not node.powered and cia402.AXIS_STATES[state].value in ("enabled", "stopping"):
                 off = DriveState.SWITCH_ON_DISABLED.value
                 raise ReadBackMismatch(node.name, "a passive axis must be free", value=state.value, limit=off)
 
@@ -259,6 +295,10 @@ class CanopenPositioners:
         if self._stopping:
             raise EnableFailed(self.axes[0], "a quick stop was commanded meanwhile", value="quick stop")
 
+    def _require_link(self) -> None:
+        if self._lost is not None or self._silent or not self._open:
+            raise LinkLost(self._bus.channel, self._lost or ("gone silent" if self._silent else "the bus is not open"))
+
     def _send(self, frames: list[CanFrame]) -> None:
         self._link.send(frames)
         if self._lost is not None:
@@ -276,8 +316,8 @@ class CanopenPositioners:
             routes[codec.COB_SDO_REPLY + node.node] = ("sdo", node.index)
             routes[codec.COB_HEARTBEAT + node.node] = ("heartbeat", node.index)
             routes[codec.COB_EMERGENCY + node.node] = ("emergency", node.index)
-        for cob, index in zip(self._image.set_point_cobs, self._image.driven, strict=True):
-            routes[cob] = ("foreign", int(index))
+        for cob, index in zip(self._image.set_point_cobs, self._image.powered, strict=True):
+            routes[cob] = ("foreign", index)
         return routes
 
     def _on_frames(self, batch: list[CanFrame]) -> None:

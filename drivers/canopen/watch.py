@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from typing import Final
 
+from docking.types import FaultKind
 from drivers.canopen import codec
 from drivers.canopen.nodes import AxisNode
 from drivers.maps.objects import ObjectMap
@@ -18,12 +19,20 @@ SILENT_FAULT: Final = 0x1_0005
 
 Fault = tuple[str, int, str]
 
+_KINDS: Final = {
+    NODE_RESTARTED: FaultKind.NODE_RESTARTED,
+    NODE_NOT_OPERATIONAL: FaultKind.NODE_RESTARTED,
+    HEARTBEAT_LOST: FaultKind.HEARTBEAT_LOST,
+    FOREIGN_SENDER: FaultKind.FOREIGN_SENDER,
+}
+
 
 class NodeWatch:
     """Keeps the first fault of any node until `rearm`; `seen_s` holds each node's last heartbeat (loop time)."""
 
     def __init__(self, nodes: tuple[AxisNode, ...], omap: ObjectMap, heartbeat_s: float) -> None:
         self.first: Fault | None = None
+        self._first_index = 0
         self.timeout_s = 3.0 * heartbeat_s
         self.seen_s: list[float | None] = [None] * len(nodes)
         self.emergencies: dict[int, int] = {}
@@ -79,6 +88,16 @@ class NodeWatch:
             if seen is not None and not (now_s - seen <= self.timeout_s):
                 self._note(index, HEARTBEAT_LOST, f"no heartbeat for {now_s - seen:.3f} s")
 
+    def verdict(self, in_fault: tuple[int, ...]) -> tuple[Fault | None, FaultKind]:
+        """What to report while the drives `in_fault` are in fault: a complaint of one that goes on comes last."""
+        if self.first is not None and self.first[1] in _KINDS:
+            return self.first, _KINDS[self.first[1]]
+        if in_fault and self._first_index not in in_fault:
+            return self.fault_of(in_fault[0]), FaultKind.DRIVE_FAULT
+        if in_fault:
+            return self.first or self.fault_of(in_fault[0]), FaultKind.DRIVE_FAULT
+        return self.first, FaultKind.DRIVE_WARNING
+
     def fault_of(self, index: int) -> Fault:
         """What is known about a drive that reports the fault state."""
         code = self.emergencies.get(index)
@@ -88,4 +107,4 @@ class NodeWatch:
 
     def _note(self, index: int, code: int, text: str) -> None:
         if self._armed and self.first is None:
-            self.first = (self._nodes[index].name, code, text)
+            self.first, self._first_index = (self._nodes[index].name, code, text), index

@@ -14,7 +14,7 @@ import pytest
 from docking.types import AxisState, Feedback
 from drivers.canopen.positioners import CanopenPositioners
 from drivers.links.can_bus import CanBusLink
-from tests.support.can_bench import can_cell
+from tests.support.can_bench import can_cell, exchange
 
 durand = pytest.importorskip("durand")
 pytestmark = [pytest.mark.peer, pytest.mark.wires]
@@ -61,9 +61,9 @@ class PeerDrive:
     )
     VARIABLES = (
         (0x1006, "UNSIGNED32"), (0x6007, "INTEGER16"), (0x6040, "UNSIGNED16"), (0x6041, "UNSIGNED16"),
-        (0x605A, "INTEGER16"), (0x605E, "INTEGER16"), (0x6060, "INTEGER8"), (0x6061, "INTEGER8"),
-        (0x6064, "INTEGER32"), (0x6065, "UNSIGNED32"), (0x6066, "UNSIGNED16"), (0x607A, "INTEGER32"),
-        (0x6085, "UNSIGNED32"), (0x60F4, "INTEGER16"), (0x6502, "UNSIGNED32"),
+        (0x605A, "INTEGER16"), (0x605D, "INTEGER16"), (0x605E, "INTEGER16"), (0x6060, "INTEGER8"),
+        (0x6061, "INTEGER8"), (0x6064, "INTEGER32"), (0x6065, "UNSIGNED32"), (0x6066, "UNSIGNED16"),
+        (0x607A, "INTEGER32"), (0x6085, "UNSIGNED32"), (0x60F4, "INTEGER16"), (0x6502, "UNSIGNED32"),
     )  # fmt: skip
     NEXT: ClassVar = {
         (0x40, 0x06): 0x21, (0x21, 0x07): 0x23, (0x23, 0x0F): 0x27, (0x27, 0x07): 0x23, (0x23, 0x06): 0x21,
@@ -118,11 +118,11 @@ async def follow(link: CanBusLink, cycles: int) -> tuple[list[Feedback], list[np
     feedback = []
     start = loop.time()
     for k, target in enumerate(path):
-        feedback.append(master.exchange(target))
+        feedback.append(exchange(master, target))
         await asyncio.sleep(start + (k + 1) * master.cycle_s - loop.time())
-    feedback.append(master.exchange(path[-1]))
+    feedback.append(exchange(master, path[-1]))
     await asyncio.sleep(master.cycle_s)
-    feedback.append(master.exchange(path[-1]))
+    feedback.append(exchange(master, path[-1]))
     await master.close()
     return feedback, path, [f"{i.product} {i.serial}" for i in identities]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from docking.config.cell import CellFile
 from docking.config.load import load_cell
-from docking.types import Array
+from docking.types import Array, Feedback
 from drivers.canopen.positioners import CanopenPositioners
 from sim.canopen import DriveGroup, DriveSettings
 from sim.wires.virtual_can import VirtualCan
@@ -64,6 +64,13 @@ def can_cell(name: str = "fuselage-can", **changes: object) -> CellFile:
     """A reference cell, with values of its bus changed."""
     cell = load_cell(CELLS / f"{name}.toml")
     return cell.model_copy(update={"bus": cell.bus.model_copy(update=changes)})
+
+
+def exchange(master: CanopenPositioners, setpoint_mm: Array) -> Feedback:
+    """One tick: the newest read-back, then the set-points and SYNC."""
+    feedback = master.latest()
+    master.send(setpoint_mm)
+    return feedback
 
 
 class Bench:

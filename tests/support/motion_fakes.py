@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from docking.errors import DeviceRefused
-from docking.kinematics import Positioners
+from docking.kinematics import Load, Positioners
 from docking.motion.monitors import Watch, WatchLimits
 from docking.types import Array, AxisState, Feedback, Identity, Plan
 
@@ -21,7 +21,7 @@ LIMITS = WatchLimits(
     warp_force_n=300.0,
     missing_cycles=2,
 )
-UP = np.array([0.0, 0.0, 1.0])
+LOAD = Load(6000.0, 0.0, np.array([600.0, 200.0, 0.0]), np.zeros(3), np.array([0.0, 0.0, -9.80665]))
 
 
 LATE_CYCLES = 20
@@ -30,7 +30,7 @@ LATE_CYCLES = 20
 def watch_of(positioners: Positioners, limits: WatchLimits = LIMITS, load_cells: ArrayLike | None = None) -> Watch:
     """The watch of positioners without load cells, or with one under each axis of the mask (m,)."""
     fitted = np.zeros(len(positioners.axes), dtype=bool) if load_cells is None else load_cells
-    return Watch(positioners, UP, limits, fitted)
+    return Watch(positioners, LOAD, limits, fitted)
 
 
 def read_back(position_mm: Array, **changes: object) -> Feedback:
@@ -52,13 +52,16 @@ class StreamedFake:
 
     def __init__(self, axes: tuple[str, ...], start_mm: Array, cycle_s: float = 0.01) -> None:
         self.axes, self.cycle_s = axes, cycle_s
+        self.a_quick_mm_s2 = np.full(len(axes), 200.0)
         self.sent: list[Array] = []
         self.sent_at_s: list[float] = []
         self.changes: dict[str, object] = {}
         self.offset_mm = np.zeros(len(axes))
         self.error: Exception | None = None
-        self.quick_stops = self.enables = 0
-        self.closed = False
+        self.quick_stops = self.enables = self.brakes = 0
+        self.brake_s = 0.2
+        self.armed: list[tuple[Array, float]] = []
+        self.closed = self.silent = False
         self._pipe = deque([start_mm] * 2, maxlen=2)
 
     async def bring_up(self) -> tuple[Identity, ...]:
@@ -69,17 +72,34 @@ class StreamedFake:
         self.enables += 1
         return read_back(self._pipe[0] + self.offset_mm)
 
-    def exchange(self, setpoint_mm: Array) -> Feedback:
+    def latest(self) -> Feedback:
+        return read_back(self._pipe[0] + self.offset_mm, **self.changes)
+
+    def send(self, setpoint_mm: Array) -> None:
         if self.error is not None:
             raise self.error
-        feedback = read_back(self._pipe[0] + self.offset_mm, **self.changes)
         self._pipe.append(setpoint_mm)
         self.sent.append(np.array(setpoint_mm))
         self.sent_at_s.append(asyncio.get_running_loop().time())
-        return feedback
+
+    async def arm_stops(self, peak_mm_s: Array, t_stop_s: float) -> None:
+        self.armed.append((np.array(peak_mm_s), t_stop_s))
+
+    async def restore_stops(self) -> None:
+        self.armed.clear()
 
     def quick_stop(self) -> None:
         self.quick_stops += 1
+
+    async def brake(self) -> None:
+        await asyncio.sleep(self.brake_s)
+        self.brakes += 1
+
+    def go_silent(self) -> None:
+        self.silent = True
+
+    async def reset_faults(self) -> None:
+        self.changes.pop("fault", None)
 
     async def close(self) -> None:
         self.closed = True

@@ -18,7 +18,7 @@ from drivers.links.can_bus import CanBusLink
 from drivers.links.unix_bus import UnixBus
 from sim.canopen import DriveGroup, DriveSettings
 from sim.wires.unix_can import UnixCanServer
-from tests.support.can_bench import FakePlant, can_cell
+from tests.support.can_bench import FakePlant, can_cell, exchange
 
 pytestmark = pytest.mark.wires
 
@@ -45,10 +45,10 @@ async def test_master_and_drives_over_the_unix_bus(tmp_path: Path) -> None:
         q = (await master.enable()).position_mm
         start = loop.time()
         for k in range(50):
-            feedback = master.exchange(q + 0.01 * (k + 1))
+            feedback = exchange(master, q + 0.01 * (k + 1))
             await asyncio.sleep(start + 0.01 * (k + 1) - loop.time())
         for _ in range(10):
-            feedback = master.exchange(q + 0.5)
+            feedback = exchange(master, q + 0.5)
             await asyncio.sleep(0.01)
         assert feedback.states == (AxisState.ENABLED,) * 12
         assert feedback.fault is None

@@ -11,7 +11,7 @@ import pytest
 from docking.ports import CanFrame
 from sim.canopen import DriveSettings
 from sim.virtual_time import run_virtual
-from tests.support.can_bench import Bench, can_cell
+from tests.support.can_bench import Bench, can_cell, exchange
 
 STEP_MM = 0.05
 
@@ -27,7 +27,7 @@ async def move(bench: Bench, q: np.ndarray, cycles: int, pause_s: float = 0.01) 
     """Move all axes on by STEP_MM a cycle; returns the last set-point."""
     for _ in range(cycles):
         q = q + STEP_MM
-        bench.master.exchange(q)
+        exchange(bench.master, q)
         await asyncio.sleep(pause_s)
     return q
 
@@ -47,15 +47,15 @@ def test_read_backs_of_two_cycles_are_never_mixed(arrived: int) -> None:
                 held.extend(ours[arrived:])
                 deliver(ours[:arrived])
 
-        before = bench.master.exchange(q).position_mm
+        before = exchange(bench.master, q).position_mm
         bench.near.on_frames = keep
         await asyncio.sleep(0.01)
-        between = bench.master.exchange(q + STEP_MM)
+        between = exchange(bench.master, q + STEP_MM)
         np.testing.assert_array_equal(between.position_mm, before)
         assert (between.age_cycles == 1.0).all()
         bench.near.on_frames = deliver
         deliver(held)
-        whole = bench.master.exchange(q + 2 * STEP_MM)
+        whole = exchange(bench.master, q + 2 * STEP_MM)
         assert np.ptp(whole.position_mm - before) <= 1e-9
         assert (whole.position_mm > before + 0.9 * STEP_MM).all()
 
@@ -66,9 +66,9 @@ def test_an_axis_that_falls_silent_ages_while_the_others_are_read_on() -> None:
     async def scenario(bench: Bench) -> None:
         q = await move(bench, await bench.ready(), 5)
         bench.drives.mute(bench.cell.axis_names[3])
-        before = bench.master.exchange(q).position_mm
+        before = exchange(bench.master, q).position_mm
         q = await move(bench, q, 6)
-        feedback = bench.master.exchange(q)
+        feedback = exchange(bench.master, q)
         others = np.arange(12) != 3
         assert feedback.age_cycles[3] >= 5.0
         assert (feedback.age_cycles[others] <= 1.0).all()

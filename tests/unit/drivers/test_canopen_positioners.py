@@ -21,7 +21,7 @@ from drivers.canopen.cia402 import DriveState, decode
 from sim.canopen import DriveSettings
 from sim.canopen.drives import Stage
 from sim.virtual_time import run_virtual
-from tests.support.can_bench import Bench, can_cell
+from tests.support.can_bench import Bench, can_cell, exchange
 
 CYCLE_S = 0.01
 
@@ -32,7 +32,7 @@ async def tick(bench: Bench, q: Callable[[int], Array], count: int) -> list[Feed
     start = loop.time()
     feedback = []
     for k in range(count):
-        feedback.append(bench.master.exchange(q(k)))
+        feedback.append(exchange(bench.master, q(k)))
         await asyncio.sleep(start + (k + 1) * CYCLE_S - loop.time())
     return feedback
 
@@ -64,7 +64,7 @@ def test_bring_up_proves_writes_and_leaves_the_axes_disabled() -> None:
         assert node.number_of(0x1017) == 100
         assert (node.number_of(0x60C2, 1), node.number_of(0x60C2, 2)) == (1, -2)
         assert node.number_of(0x1402, 1) >> 31, "a set-point PDO that the factory left valid is switched off"
-        feedback = bench.master.exchange(np.full(12, np.nan))
+        feedback = exchange(bench.master, np.full(12, np.nan))
         assert feedback.states == (AxisState.DISABLED,) * 12
         np.testing.assert_allclose(feedback.position_mm, bench.start_mm, atol=1e-9)
 
@@ -83,7 +83,7 @@ def test_passive_axes_have_no_set_point_frame_and_stay_free() -> None:
         for node, driven in zip(bench.drives.nodes, bench.cell.driven, strict=True):
             enabled = bench.drives.drives.stages[node.index] is Stage.OPERATION
             assert enabled == driven
-        feedback = bench.master.exchange(np.where(bench.cell.driven, bench.start_mm, np.nan))
+        feedback = exchange(bench.master, np.where(bench.cell.driven, bench.start_mm, np.nan))
         np.testing.assert_allclose(feedback.position_mm, bench.start_mm, atol=1e-9)
 
     run_virtual(main)
@@ -261,7 +261,7 @@ def test_first_set_point_far_from_the_axis_is_refused_and_not_sent() -> None:
         far = q.copy()
         far[3] = 0.0
         with pytest.raises(ReadBackMismatch) as caught:
-            bench.master.exchange(far)
+            exchange(bench.master, far)
         assert caught.value.where == "B.X"
         assert caught.value.value == pytest.approx(abs(q[3]))
         await asyncio.sleep(0.05)
@@ -307,7 +307,7 @@ def test_impossible_set_point_is_refused_by_name(bad: float) -> None:
         wrong = q.copy()
         wrong[5] = bad
         with pytest.raises(AxisLimitExceeded) as caught:
-            bench.master.exchange(wrong)
+            exchange(bench.master, wrong)
         assert caught.value.where == "B.Z"
         assert not bench.trace
 
@@ -551,7 +551,7 @@ def test_lost_link() -> None:
         await tick(bench, lambda k: q, 3)
         bench.bus.cut("cable pulled")
         with pytest.raises(LinkLost, match="cable pulled"):
-            bench.master.exchange(q)
+            exchange(bench.master, q)
         bench.master.quick_stop()
         await bench.master.close()
 

@@ -13,7 +13,7 @@ from docking.ports import CanFrame
 from sim.canopen import DriveSettings
 from sim.canopen.drives import SYNC_LOST, Stage
 from sim.virtual_time import run_virtual
-from tests.support.can_bench import Bench, can_cell
+from tests.support.can_bench import Bench, can_cell, exchange
 
 STEP_MM = 0.05
 
@@ -33,14 +33,14 @@ async def stalled(bench: Bench, cycles: int) -> list[tuple[float, np.ndarray]]:
         if k == 20:
             bench.far.on_frames, deliver = waiting.extend, bench.far.on_frames
         q = q + STEP_MM
-        bench.master.exchange(q)
+        exchange(bench.master, q)
         await asyncio.sleep(0.01)
     bench.far.on_frames = deliver
     count = len(bench.plant.calls)
     deliver(waiting)
     for _ in range(10):
         q = q + STEP_MM
-        bench.master.exchange(q)
+        exchange(bench.master, q)
         await asyncio.sleep(0.01)
     return bench.plant.calls[count - 1 :]
 
