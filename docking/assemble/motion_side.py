@@ -7,7 +7,6 @@ import math
 
 from docking.assemble.wires import Addresses
 from docking.config import CellFile, JobFile
-from docking.config.build import positioners_from
 from docking.config.cell import ModbusBus
 from docking.motion import QueuedMotion, StreamedMotion
 from docking.motion.channel import QueueChannel
@@ -26,7 +25,6 @@ def local_motion(cell: CellFile, job: JobFile, can: CanLink | None, modbus: Addr
         return QueuedMotion(ModbusPositioners(cell, modbus), watch, cell.bus.poll_s)
     if can is None:
         raise ValueError("a CANopen cell needs the near end of its bus")
-    a_quick_mm_s2 = positioners_from(cell, job).a_quick_mm_s2
     return StreamedMotion(CanopenPositioners(cell, can), watch, cell.limits.tick_late_cycles)
 
 

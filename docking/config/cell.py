@@ -219,15 +219,15 @@ class LimitsConfig(Model):
         description="stop when the load cells show more force at a ball, beyond what weight and attitude let expect, "
         "than when the move was loaded, N",
     )
-    measured_warp_n: Positive = Field(default=1000.0, description="the same for the warp of the vertical axes, N")
+    measured_warp_n: Positive = Field(default=600.0, description="the same for the warp of the vertical axes, N")
     measured_whole_force_n: Positive = Field(
-        default=3000.0,
+        default=2500.0,
         description="the same without a tare; wider, because load cells drift and cross-talk and mass and centre of "
         "mass have tolerances, N",
     )
-    measured_whole_warp_n: Positive = Field(default=2000.0, description="the same for the warp, N")
+    measured_whole_warp_n: Positive = Field(default=1200.0, description="the same for the warp, N")
     overload_fraction: Annotated[float, Field(gt=1.0, le=3.0)] = Field(
-        default=1.25, description="stop when a ball carries more than this times what it is expected to carry"
+        default=1.1, description="stop when a ball carries more than this times what it is expected to carry"
     )
     underload_fraction: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(
         default=0.5, description="stop when a ball carries less than this times what it is expected to carry"

@@ -13,7 +13,7 @@ from docking.kinematics.forces import (
     warp_rows,
 )
 from docking.kinematics.forward import figure_residual_mm, pose_from_axes
-from docking.kinematics.monitor import CouplingMonitor, coupling_monitor
+from docking.kinematics.monitor import Coupling, CouplingMonitor, coupling_monitor, pose_step_matrix
 from docking.kinematics.positioners import (
     Conditioning,
     Positioners,
@@ -28,6 +28,7 @@ from docking.kinematics.positioners import (
 
 __all__ = [
     "Conditioning",
+    "Coupling",
     "CouplingMonitor",
     "Load",
     "Positioners",
@@ -46,6 +47,7 @@ __all__ = [
     "internal_force_matrix",
     "internal_forces_n",
     "pose_from_axes",
+    "pose_step_matrix",
     "reaction_extremes",
     "sink_mm",
     "socket_positions",

@@ -1,0 +1,259 @@
+"""All monitors of one control cycle, in the order in which their findings matter."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from docking.errors import (
+    AxisAtLimit,
+    AxisNotEnabled,
+    ConsistencyTrip,
+    DriveFault,
+    DriveWarning,
+    FeedbackMissing,
+    InternalForceTrip,
+    MotionError,
+    PassiveAxisTrip,
+    WarpTrip,
+)
+from docking.kinematics import Coupling, CouplingMonitor, Load, Positioners, coupling_monitor, socket_positions
+from docking.motion.monitors.limits import Margins, Timing, WatchLimits
+from docking.motion.monitors.loads import BallLoads
+from docking.motion.monitors.travel import Travel
+from docking.motion.triggers import Finding, Trigger
+from docking.types import Array, AxisState, FaultKind, Feedback, Plan
+
+LATE_IN_A_ROW = 2
+"""Cycles in a row that go without the figure because a read-back is late, however many may be missed by one axis."""
+
+_NONE = Coupling(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class Watch:
+    """Judges read-backs against the commanded figure and keeps the maxima.
+
+    `load_cells` (m,) are the axes whose force is measured. `evaluate` is the hot path: a handful of small array
+    operations a cycle, next to nothing at rest while the read-backs stay the same.
+    """
+
+    def __init__(
+        self,
+        positioners: Positioners,
+        load: Load,
+        limits: WatchLimits,
+        load_cells: ArrayLike,
+        timing: Timing | None = None,
+    ) -> None:
+        self._positioners, self._up, self._limits = positioners, load.up, limits
+        self._axes = positioners.axes
+        self.driven = np.asarray(positioners.driven, dtype=bool)
+        self._powered = np.asarray(positioners.powered, dtype=bool).tolist()
+        self._margins = Margins()
+        self._travel = Travel(positioners, limits, timing or Timing(), self._margins)
+        weighed = np.asarray(load_cells, dtype=np.bool_)
+        self._loads = BallLoads(positioners, load, limits, weighed, self._margins)
+        self._coupling: CouplingMonitor | None = None
+        self._enabled: tuple[AxisState, ...] = ()
+        self._late_in_a_row = 0
+        self._clean: tuple[Feedback, Array] | None = None
+        self.coupling = _NONE
+        self.reset_maxima()
+
+    # what is known of the last evaluation ------------------------------------------------------------------------
+    @property
+    def residual_mm(self) -> float:
+        """Largest ball residual."""
+        return self.coupling.residual_mm
+
+    @property
+    def internal_force_n(self) -> float:
+        """Largest internal force at a ball, predicted from the read-backs."""
+        return self.coupling.force_n
+
+    @property
+    def warp_n(self) -> float:
+        """Warp of the vertical axes, predicted from the read-backs."""
+        return self.coupling.warp_n
+
+    @property
+    def measured_force_n(self) -> float:
+        """Largest internal force at a ball, measured, since the move was loaded; NaN without load cells."""
+        return self._loads.force_n
+
+    @property
+    def max_following_mm(self) -> Array:
+        """Largest |following error| (m,) since the maxima were reset."""
+        return self._travel.max_following_mm
+
+    def margins(self) -> dict[str, float]:
+        """The nearest that each monitor has ever come to its limit, as a fraction of the limit; over 1 it tripped."""
+        return dict(sorted(self._margins.peaks.items()))
+
+    def reset_maxima(self) -> None:
+        """Forget the maxima; called when a move starts."""
+        self.max_residual_mm = 0.0
+        self.max_internal_force_n = 0.0
+        self._travel.max_following_mm = np.zeros(len(self._axes))
+
+    # preparation -------------------------------------------------------------------------------------------------
+    def watch_about(self, q_mm: Array, *, relief: bool = False) -> None:
+        """Linearise coupling and expected loads about the axis positions `q_mm` (m,) at standstill, and tare there.
+
+        `relief` says that the move to come starts from a strained part.
+        """
+        self._coupling = coupling_monitor(self._positioners, socket_positions(self._positioners, q_mm), self._up)
+        self._travel.forget()
+        self._loads.about(q_mm, relief=relief)
+        self._clean = None
+
+    def quick_slew_per_s(self, plan: Plan) -> float:
+        """How fast a fault may turn the rate of `plan` down: with the path's own acceleration, inside the quick-stop
+        deceleration of every axis. Every cycle that a jammed axis is left behind strains the part."""
+        peak = np.abs(np.diff(plan.q_mm, axis=0)).max(axis=0) / plan.period_s
+        spare = (self._positioners.a_quick_mm_s2 - self._positioners.a_mm_s2) / np.maximum(peak, 1e-9)
+        return max(plan.rate_slew_per_s, float(np.min(spare[self.driven])))
+
+    # the cycle ---------------------------------------------------------------------------------------------------
+    def power(self, feedback: Feedback, *, may_stop: bool = False) -> MotionError | None:
+        """The first powered axis that is not enabled, or None; with `may_stop` an axis may also be ramping down."""
+        if feedback.states is self._enabled:
+            return None
+        for axis, state, powered in zip(self._axes, feedback.states, self._powered, strict=True):
+            if powered and not (state is AxisState.ENABLED or (may_stop and state is AxisState.STOPPING)):
+                return AxisNotEnabled(axis, value=state.value, limit=AxisState.ENABLED.value)
+        if not may_stop:
+            self._enabled = feedback.states
+        return None
+
+    def evaluate(
+        self,
+        feedback: Feedback,
+        q_ref_mm: Array,
+        speed_mm_s: Array | float,
+        *,
+        moving: bool,
+        may_stop: bool = False,
+    ) -> Finding | None:
+        """The finding that asks for the most severe reaction, or None.
+
+        `q_ref_mm` (m,) is the rigid figure the read-back belongs to, `speed_mm_s` (m,) the commanded speed there.
+        `moving` says that a move runs; `may_stop` says that an axis may be ramping down by itself, as a device does
+        that was told to stop.
+        """
+        if not moving and self._unchanged(feedback, q_ref_mm):
+            return None
+        finding = self._devices(feedback, may_stop=may_stop)
+        if finding is None and feedback.age_cycles.max() > 0.0:
+            finding = self._judge_late(feedback, q_ref_mm, speed_mm_s, moving)
+        elif finding is None:
+            self._late_in_a_row = 0
+            led = not (may_stop and AxisState.STOPPING in feedback.states)
+            finding = (
+                self._travel.judge(feedback, q_ref_mm, moving=moving, led=led)
+                or self._figure(feedback.position_mm, q_ref_mm)
+                or self._loads.judge(feedback.force_n, feedback.t_s, q_ref_mm, moving=moving)
+                or self._travel.following(feedback.following_error_mm, speed_mm_s)
+            )
+        finding = finding or self._told(feedback)
+        self._clean = (feedback, q_ref_mm) if finding is None else None
+        return finding
+
+    def _unchanged(self, feedback: Feedback, q_ref_mm: Array) -> bool:
+        """True when a driver passed on the same values: what was judged a cycle ago needs no second judgement."""
+        if self._clean is None:
+            return False
+        before, reference = self._clean
+        same = (
+            feedback.position_mm is before.position_mm
+            and feedback.following_error_mm is before.following_error_mm
+            and feedback.force_n is before.force_n
+            and feedback.states is before.states
+            and feedback.age_cycles is before.age_cycles
+            and feedback.fault is before.fault
+            and feedback.at_limit is before.at_limit
+            and q_ref_mm is reference
+        )
+        if same:
+            self._travel.unchanged(feedback.t_s)
+        return same
+
+    def _devices(self, feedback: Feedback, *, may_stop: bool) -> Finding | None:
+        """What the devices say of themselves: faults, axes that are off, axes that are silent."""
+        if feedback.fault is not None and feedback.fault_kind is not FaultKind.DRIVE_WARNING:
+            axis, code, text = feedback.fault
+            return Finding(Trigger[feedback.fault_kind.name], DriveFault(axis, text, value=code))
+        off = self.power(feedback, may_stop=may_stop)
+        if off is not None:
+            return Finding(Trigger.AXIS_OFF, off)
+        worst_age, limit = float(feedback.age_cycles.max()), self._limits.missing_cycles
+        if worst_age == 0.0 or self._margins.note("missing_feedback", worst_age / limit):
+            return None
+        axis = self._axes[int(np.argmax(feedback.age_cycles))]
+        return Finding(Trigger.FEEDBACK_MISSING, FeedbackMissing(axis, value=worst_age, limit=limit))
+
+    def _told(self, feedback: Feedback) -> Finding | None:
+        """What devices warn of: limit switches, emergencies of drives that go on."""
+        if feedback.at_limit is not None and feedback.at_limit.any():
+            return Finding(Trigger.LIMIT_SWITCH, AxisAtLimit(self._axes[int(np.argmax(feedback.at_limit))]))
+        if feedback.fault is not None:
+            axis, code, text = feedback.fault
+            return Finding(Trigger.DRIVE_WARNING, DriveWarning(axis, text, value=code))
+        return None
+
+    def _judge_late(
+        self, feedback: Feedback, q_ref_mm: Array, speed_mm_s: Array | float, moving: bool
+    ) -> Finding | None:
+        """Judge without the figure, a few times: a late read-back beside fresh ones would look like a squeezed part."""
+        self._late_in_a_row += 1
+        finding = self._loads.judge(
+            feedback.force_n, feedback.t_s, q_ref_mm, moving=moving
+        ) or self._travel.following(feedback.following_error_mm, speed_mm_s)
+        if finding is None and self._late_in_a_row > LATE_IN_A_ROW:
+            finding = self._figure(feedback.position_mm, q_ref_mm)
+        if finding is None:
+            return None
+        axis = self._axes[int(np.argmax(feedback.age_cycles))]
+        cause = f"{axis} has not reported for {feedback.age_cycles.max():.0f} cycles."
+        error = finding.error
+        return Finding(finding.trigger, type(error)(error.where, cause, value=error.value, limit=error.limit))
+
+    # the figure --------------------------------------------------------------------------------------------------
+    def _figure(self, position_mm: Array, q_ref_mm: Array) -> Finding | None:
+        if self._coupling is None:
+            return None
+        off_mm = position_mm - q_ref_mm
+        self.coupling = found = self._coupling.evaluate(off_mm)
+        self.max_residual_mm = max(self.max_residual_mm, found.residual_mm)
+        self.max_internal_force_n = max(self.max_internal_force_n, found.force_n)
+        limits, note = self._limits, self._margins.note
+        inside = (
+            note("ball_residual", found.residual_mm / limits.ball_residual_mm),
+            note("ball_rms", found.rms_mm / limits.ball_rms_mm),
+            note("ball_pair", found.pair_mm / limits.ball_pair_mm),
+            note("predicted_force", found.force_n / limits.internal_force_n),
+            note("predicted_warp", found.warp_n / limits.warp_force_n),
+            note("passive_axis", found.passive_mm / limits.passive_mm),
+        )
+        return None if all(inside) else self._strained(inside.index(False), off_mm)
+
+    def _strained(self, case: int, off_mm: Array) -> Finding:
+        """The finding of the first figure that is over its limit."""
+        found, limits, cause = self.coupling, self._limits, self._worst(off_mm)
+        if case == 5 and self._coupling is not None:
+            axis = self._axes[self._coupling.worst_passive()]
+            passive = PassiveAxisTrip(axis, value=found.passive_mm, limit=limits.passive_mm)
+            return Finding(Trigger.PASSIVE_AXIS, passive)
+        trigger, kind, where, value, limit = (
+            (Trigger.COUPLING, ConsistencyTrip, "ball centres", found.residual_mm, limits.ball_residual_mm),
+            (Trigger.COUPLING, ConsistencyTrip, "ball centres, rms", found.rms_mm, limits.ball_rms_mm),
+            (Trigger.COUPLING, ConsistencyTrip, "distances of ball centres", found.pair_mm, limits.ball_pair_mm),
+            (Trigger.PREDICTED_FORCE, InternalForceTrip, "ball centres", found.force_n, limits.internal_force_n),
+            (Trigger.PREDICTED_WARP, WarpTrip, "Z axes", found.warp_n, limits.warp_force_n),
+        )[case]
+        return Finding(trigger, kind(where, cause, value=value, limit=limit))
+
+    def _worst(self, off_mm: Array) -> str:
+        """The axis that is farthest from its place on the path."""
+        k = int(np.argmax(np.abs(off_mm)))
+        return f"{self._axes[k]} is {off_mm[k]:+.3f} mm from its place."
