@@ -49,7 +49,9 @@ class Company:
     aside: Aside = at_once
 
 
-def build_cell(cell: CellFile, job: JobFile, wires: Wires, company: Company, motion: Motion | None = None) -> Cell[Procedure]:
+def build_cell(
+    cell: CellFile, job: JobFile, wires: Wires, company: Company, motion: Motion | None = None
+) -> Cell[Procedure]:
     """The whole controller of one docking; without `motion` the motion side runs on this very loop."""
     positioners = positioners_from(cell, job)
     if motion is None:

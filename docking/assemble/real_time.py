@@ -22,22 +22,27 @@ TICKS, COMPUTING = 10, 1
 """Real-time priorities: both go before ordinary programs, the ticks before what is worked out aside."""
 
 
-def run_real(main: Callable[[], Coroutine[Any, Any, T]], say_late: Callable[[], None] | None = None) -> T:
+def run_real(
+    main: Callable[[], Coroutine[Any, Any, T]], say_late: Callable[[], None] | None = None, *, ticks: bool = True
+) -> T:
     """Run `main()` to its end in real time and return its result.
 
-    `say_late` is called where the operating system gives this program no priority over others, so that ticks may come
-    late on a busy computer.
+    `ticks` says that something here has to be on time: the program then goes before others. `say_late` is called where
+    the operating system does not permit that, so that ticks may come late on a busy computer.
     """
-    with _punctual() as first, asyncio.Runner(loop_factory=_loop) as runner:
+    with _punctual(ticks) as first, asyncio.Runner(loop_factory=lambda: _loop(ticks)) as runner:
         if not first and say_late is not None:
             say_late()
         return runner.run(main())
 
 
-def on_interrupt(act: Callable[[], None]) -> None:
+ENDINGS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+def on_interrupt(act: Callable[[], None], signals: tuple[signal.Signals, ...] = ENDINGS) -> None:
     """Let Ctrl-C, a request to terminate and the end of the terminal call `act` on the running loop."""
     loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in signals:
         loop.add_signal_handler(number, act)
 
 
@@ -46,28 +51,29 @@ async def aside(work: Callable[[], T]) -> T:
     return await asyncio.to_thread(work)
 
 
-def _loop() -> asyncio.AbstractEventLoop:
+def _loop(ticks: bool) -> asyncio.AbstractEventLoop:
     # epoll rounds every wait up to a whole millisecond, select does not.
     loop = asyncio.SelectorEventLoop(selectors.SelectSelector())
-    loop.set_default_executor(ThreadPoolExecutor(initializer=_go_before_others, initargs=(COMPUTING,)))
+    if ticks:
+        loop.set_default_executor(ThreadPoolExecutor(initializer=_go_before_others, initargs=(COMPUTING,)))
     return loop
 
 
 def _go_before_others(priority: int) -> bool:
     """Give the calling thread, and those it starts, a real-time priority; False where that is not allowed."""
     try:
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(priority))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except (OSError, AttributeError):
         return False
     return True
 
 
 @contextmanager
-def _punctual() -> Iterator[bool]:
-    """Priority, short turns for computing threads, no long garbage collections; all as before afterwards."""
+def _punctual(ticks: bool) -> Iterator[bool]:
+    """Short turns for computing threads, no long garbage collections, priority for `ticks`; as before afterwards."""
     turn_s = sys.getswitchinterval()
     policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
-    first = _go_before_others(TICKS)
+    first = not ticks or _go_before_others(TICKS)
     sys.setswitchinterval(SWITCH_S)
     # What is loaded by now stays: a collection that walks through it would take tens of milliseconds.
     gc.collect()

@@ -17,19 +17,19 @@ from typing import Any
 from docking.assemble.controller import Company, Wires, build_cell
 from docking.assemble.real_time import aside, on_interrupt, run_real
 from docking.assemble.simulated import FarEnd, make_far_end, real_wires, truth_of, virtual_wires
+from docking.assemble.spawned import MotionProcess
 from docking.cell import Cell
 from docking.config import CellFile, JobFile
 from docking.config.load import default_job_path, file_sha256, load_cell, load_job
 from docking.errors import BadArgument, FileUnreadable, FileUnwritable
 from docking.journal import JournalFile, read
 from docking.operators import AutomaticOperator, TerminalOperator
-from docking.ports import Operator, at_once
+from docking.ports import Journal, Motion, Operator, at_once
 from docking.progress import Progress
 from docking.records import alarm_record
 from docking.state import Event, State
 from docking.version import VERSION
 from docking.words import tell
-from drivers.links.can_bus import CanBusLink
 from drivers.links.serial_port import SerialPort
 from sim.truth import TruthFile
 from sim.virtual_time import run_virtual
@@ -94,13 +94,13 @@ def dry_run(request: RunRequest, say: Say) -> dict[str, Any]:
 def dry_run_files(files: Files, truth: TruthFile, request: RunRequest, say: Say) -> dict[str, Any]:
     """`dry_run` with files already loaded and a truth of the caller's choice (studies)."""
     with ExitStack() as stack:
-        path = _journal_path(request, stack)
+        path = journal_path(request, stack)
 
         async def main() -> dict[str, Any]:
             far = make_far_end(files.cell, files.job, truth, request.seed)
             wires = await virtual_wires(files.cell, far)
             operator = AutomaticOperator(say, request.language)
-            return await _dock(_Run(files, request, wires, operator, path, far, simulated=True, real=False))
+            return await _dock(_Run(files, request, wires, operator, path, far, simulated=True))
 
         summary = run_virtual(main)
         return _finish(request, path, summary)
@@ -110,8 +110,9 @@ def run_on_wires(request: RunRequest, choice: WireChoice, say: Say, *, step: boo
     """Dock over real wires; with `step` a person confirms every move in the terminal."""
     files = load_files(request)
     with ExitStack() as stack:
-        path = _journal_path(request, stack)
+        path = journal_path(request, stack)
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="docking-")))
+        process = stack.enter_context(MotionProcess())
 
         async def main() -> dict[str, Any]:
             far = None
@@ -119,16 +120,19 @@ def run_on_wires(request: RunRequest, choice: WireChoice, say: Say, *, step: boo
                 far = make_far_end(files.cell, files.job, truth_of(request.cell_path), request.seed)
                 found = await real_wires(files.cell, far, folder)
             else:
-                found = _read_wires(choice.wires, files.cell) if choice.wires else {}
+                found = read_wires(choice.wires, files.cell) if choice.wires else {}
             operator = (TerminalOperator if step else AutomaticOperator)(say, request.language)
-            wires = near_ends(files.cell, found)
+            wires = Wires(SerialPort(found.get("tracker", files.cell.tracker.port), files.cell.tracker.baud))
+            joined = _Joined(process, found)
             try:
-                return await _dock(_Run(files, request, wires, operator, path, far, simulated=choice.sim))
+                return await _dock(_Run(files, request, wires, operator, path, far, choice.sim, joined))
             finally:
                 if far is not None:
                     await far.close()
 
-        return _finish(request, path, run_real(main, lambda: say(tell(request.language, "no_priority"))))
+        # Ticks are the motion process' business; here only those of simulated devices have to be on time.
+        own_devices = choice.sim and choice.wires is None
+        return _finish(request, path, run_real(main, ticks=own_devices))
 
 
 def serve(request: RunRequest, wires_file: Path | None, say: Say) -> None:
@@ -160,15 +164,12 @@ def serve(request: RunRequest, wires_file: Path | None, say: Say) -> None:
         run_real(main)
 
 
-def near_ends(cell: CellFile, found: dict[str, Any]) -> Wires:
-    """The near ends of real wires: at the addresses of simulated devices in `found`, else those of the cell file."""
-    serial = SerialPort(found.get("tracker", cell.tracker.port), cell.tracker.baud)
-    if cell.bus.kind == "modbus-tcp":
-        listed = found.get("modbus")
-        return Wires(serial, modbus={n: (str(h), int(p)) for n, (h, p) in listed.items()} if listed else None)
-    if "can" in found:
-        return Wires(serial, can=CanBusLink("docking-unix", found["can"], cell.bus.bitrate))
-    return Wires(serial, can=CanBusLink(cell.bus.interface, cell.bus.channel, cell.bus.bitrate))
+@dataclass(frozen=True)
+class _Joined:
+    """The motion process of a run, and where it finds simulated devices."""
+
+    process: MotionProcess
+    found: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -180,7 +181,7 @@ class _Run:
     journal_path: Path
     far: FarEnd | None
     simulated: bool
-    real: bool = True
+    joined: _Joined | None = None
 
 
 async def _dock(run: _Run) -> dict[str, Any]:
@@ -190,18 +191,42 @@ async def _dock(run: _Run) -> dict[str, Any]:
     journal = JournalFile(run.journal_path, loop.time)
     try:
         journal.write("run_started", _started(run), durable=True)
-        company = Company(journal, run.operator, loop.time, aside if run.real else at_once)
-        cell = build_cell(run.files.cell, run.files.job, run.wires, company)
+        company = Company(journal, run.operator, loop.time, aside if run.joined else at_once)
+        motion = await _joined_motion(run, run.joined, journal) if run.joined else None
+        cell = build_cell(run.files.cell, run.files.job, run.wires, company, motion)
         run.operator.attend(cell.post, cell.override)
-        if run.real:
+        if run.joined:
             on_interrupt(lambda: _abort(cell, run.operator))
-        state = await cell.dock()
+        try:
+            state = await cell.dock()
+        finally:
+            if run.joined:
+                journal.write("motion_process", await run.joined.process.end())
         times = (loop.time() - started_s, time.perf_counter() - wall_s)
         summary = _summary(run, cell, state, times)
         journal.write("outcome", summary, durable=True)
         return summary
     finally:
         journal.close()
+
+
+async def _joined_motion(run: _Run, joined: _Joined, journal: Journal) -> Motion:
+    """The motion side in its own process; what it says of itself is kept, and told where it matters."""
+    files = run.files
+    fastest_mm_s = max(stage.speed_mm_s for stage in files.job.stages)
+
+    def hear(kind: str, body: Any) -> None:
+        if kind == "lateness":
+            journal.write("lateness", body)
+            if not (fastest_mm_s <= body["speed_limit_mm_s"]):
+                late_ms, limit_mm_s = 1e3 * body["p999_s"], body["speed_limit_mm_s"]
+                run.operator.notify("slowed", late_ms=late_ms, limit_mm_s=limit_mm_s)
+            return
+        journal.write("motion_process", body if isinstance(body, dict) else {kind: body})
+        if kind == "hello" and not body["priority"]:
+            run.operator.notify("no_priority")
+
+    return await joined.process.join((run.request.cell_path, files.job_path), files.cell, joined.found, hear)
 
 
 def _abort(cell: Cell, operator: Operator) -> None:
@@ -272,7 +297,7 @@ def _finish(request: RunRequest, journal_path: Path, summary: dict[str, Any]) ->
     return summary
 
 
-def _journal_path(request: RunRequest, stack: ExitStack) -> Path:
+def journal_path(request: RunRequest, stack: ExitStack) -> Path:
     """Where the journal of this run goes: as asked, beside the report, or into a folder that ends with the run.
 
     Raises FileUnwritable before anything moves where journal or report cannot be written.
@@ -329,7 +354,7 @@ def _refuse_real_devices(path: Path, found: dict[str, Any]) -> None:
         raise BadArgument("--wires", f"{far[0]} is no simulated device of this machine", value=str(path))
 
 
-def _read_wires(path: Path, cell: CellFile) -> dict[str, Any]:
+def read_wires(path: Path, cell: CellFile) -> dict[str, Any]:
     """The addresses that `docking sim` wrote. Raises FileUnreadable, BadArgument when they are not this cell's."""
     try:
         found = json.loads(path.read_text("utf-8"))

@@ -66,13 +66,24 @@ class QueueChannel:
 
 
 class SocketChannel(asyncio.Protocol):
-    """One end of a connected stream socket."""
+    """One end of a connected stream socket. What comes before anybody listens waits; `closed` is set at the end."""
 
     def __init__(self) -> None:
-        self.on_message: Callable[[bytes], None] = _ignore
         self.on_lost: Callable[[str], None] = _ignore
+        self.closed = asyncio.Event()
+        self._listener: Callable[[bytes], None] = _ignore
         self._transport: asyncio.Transport | None = None
         self._come = bytearray()
+
+    @property
+    def on_message(self) -> Callable[[bytes], None]:
+        return self._listener
+
+    @on_message.setter
+    def on_message(self, listener: Callable[[bytes], None]) -> None:
+        self._listener = listener
+        if self._transport is not None:
+            self._transport.resume_reading()
 
     @classmethod
     async def open(cls, end: socket.socket) -> SocketChannel:
@@ -84,6 +95,7 @@ class SocketChannel(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
+        transport.pause_reading()
 
     def data_received(self, data: bytes) -> None:
         self._come += data
@@ -99,6 +111,7 @@ class SocketChannel(asyncio.Protocol):
             self._lose(error.text())
 
     def connection_lost(self, exc: Exception | None) -> None:
+        self.closed.set()
         self._lose(str(exc) if exc else "the other end closed the channel")
 
     def _lose(self, reason: str) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
-from docking.errors import DockingError, MotionProcessLost, PlanStale
+from docking.errors import BadArgument, DockingError, MotionProcessLost, PlanStale
 from docking.motion.channel import Channel
 from docking.motion.messages import WHERE, decode, encode
 from docking.types import Array, Feedback, Identity, MoveResult, Plan
@@ -92,6 +92,12 @@ class RemoteMotion:
         else:
             # A hold that comes before the start counts from the first set-point on.
             self._early.append(verb)
+
+    def override(self, percent: float) -> None:
+        """Run plans at 0 to 100 % of their speed from now on. Raises BadArgument outside, and nothing changes."""
+        if not (0.0 <= percent <= 100.0):
+            raise BadArgument("speed override", value=percent, limit="0 to 100 %")
+        self._channel.send(encode("override", 0, float(percent)))
 
     def feedback(self) -> Feedback:
         """The newest read-back told, at most the lease old. Raises the fault that the motion side holds."""

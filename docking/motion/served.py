@@ -41,6 +41,8 @@ class LocalMotion(Protocol):
 
     def request(self, verb: str) -> None: ...
 
+    def override(self, percent: float) -> None: ...
+
     def report(self, finding: Finding) -> None:
         """Something outside the axes asks for a reaction: judged and latched as what the monitors find."""
         ...
@@ -99,6 +101,8 @@ class ServedMotion:
             # A verb for a move that has ended meanwhile would hold or stop the next one.
             if number in self._calls:
                 self._motion.request(payload)
+        elif kind == "override":
+            self._motion.override(payload)
         elif kind == "cancel":
             if number in self._calls:
                 self._calls[number].cancel()
