@@ -12,7 +12,7 @@ from docking.types import Identity
 from drivers.canopen import codec
 from drivers.canopen.nodes import AxisNode
 from drivers.canopen.sdo import SdoClient
-from drivers.maps.objects import ObjectEntry, ObjectMap, PdoEntry
+from drivers.maps.objects import ForceMode, ObjectEntry, ObjectMap, PdoEntry
 
 _MODE_S = 0.5
 _NO_SUCH_OBJECT = "06020000h"
@@ -44,6 +44,17 @@ def quantities(node: AxisNode, bus: CanBus, limits: LimitsConfig, omap: ObjectMa
         "quick_stop_counts_s2": round(axis.a_quick_mm_s2 * counts),
         "interpolation_value": value,
         "interpolation_exponent": exponent,
+        **_force_quantities(node, omap.force_mode),
+    }
+
+
+def _force_quantities(node: AxisNode, mode: ForceMode) -> dict[str, int]:
+    """What bounds an axis that holds a force; nothing for any other."""
+    if node.force_n is None:
+        return {}
+    return {
+        "max_torque_counts": round(mode.max_force * node.force_n / mode.newton_per_count),
+        "max_speed_rpm": round(mode.max_speed * node.axis.v_mm_s * 60.0 / mode.mm_per_revolution),
     }
 
 
@@ -54,6 +65,8 @@ class NodeBringUp:
         self.node = node
         self.sdo = SdoClient(node.name, node.node, send, omap.abort_text)
         self._map = omap
+        self._holds_force = node.force_n is not None
+        self._mode = omap.force_mode.mode if self._holds_force else omap.mode
 
     async def run(self, given: dict[str, int]) -> Identity:
         """Prove who answers; write and read back everything.
@@ -61,7 +74,7 @@ class NodeBringUp:
         Raises DeviceSilent, DeviceRefused, BadReply, WrongIdentity, ReadBackMismatch.
         """
         identity = await self._identify()
-        for name, value in self._map.written:
+        for name, value in self._map.written + (self._map.force_mode.written if self._holds_force else ()):
             number = given[value[1:]] if isinstance(value, str) else value
             await self._write(self._map.objects[name], number)
         await self._map_pdos()
@@ -84,15 +97,23 @@ class NodeBringUp:
             self._expect(name, found[name], value)
         if self.node.axis.serial_number is not None:
             self._expect("serial number", found["serial"], self.node.axis.serial_number)
-        modes = await read(objects["supported_modes"])
-        if not modes >> self._map.supported_mode_bit & 1:
-            cause = "the drive has no cyclic synchronous position mode"
-            raise WrongIdentity(self.node.name, cause, value=f"6502h = {modes:08X}h", limit=f"mode {self._map.mode}")
+        await self._identify_mode()
         name_text = await self._text("device_name")
         version = await self._text("software_version")
         product = f"{name_text} {found['product']:08X}h".strip()
         firmware = f"{version} revision {found['revision']:08X}h".strip()
         return Identity(self.node.name, f"{found['vendor']:08X}h", product, str(found["serial"]), firmware)
+
+    async def _identify_mode(self) -> None:
+        """The drive must have the mode, and for a held force the rated torque that its unit rests on."""
+        objects, force_mode = self._map.objects, self._map.force_mode
+        modes = await self.sdo.read(objects["supported_modes"])
+        bit = force_mode.supported_mode_bit if self._holds_force else self._map.supported_mode_bit
+        if not modes >> bit & 1:
+            cause = f"the drive has no cyclic synchronous {'torque' if self._holds_force else 'position'} mode"
+            raise WrongIdentity(self.node.name, cause, value=f"6502h = {modes:08X}h", limit=f"mode {self._mode}")
+        if self._holds_force:
+            self._expect("rated torque", await self.sdo.read(objects["rated_torque"]), force_mode.rated_torque_mnm)
 
     def _refuse_twin(self) -> None:
         if self.sdo.stray:
@@ -121,7 +142,7 @@ class NodeBringUp:
         for communication, cob in self._map.pdos_off:
             await self._switch_off(communication, cob + self.node.node)
         pdos = self._map.pdos
-        await self._map_pdo(pdos["set_points"], self.node.driven)
+        await self._map_pdo(pdos["force_set_points" if self._holds_force else "set_points"], self.node.powered)
         await self._map_pdo(pdos["read_back"], True)
         await self._map_pdo(pdos["force"], self.node.load_cell)
 
@@ -159,9 +180,9 @@ class NodeBringUp:
     async def _set_mode(self) -> None:
         """Select the mode and wait until the drive displays it: a write alone proves nothing."""
         objects, loop = self._map.objects, asyncio.get_running_loop()
-        await self._write(objects["mode"], self._map.mode)
+        await self._write(objects["mode"], self._mode)
         deadline = loop.time() + _MODE_S
-        while await self.sdo.read(objects["mode_display"]) != self._map.mode:
+        while await self.sdo.read(objects["mode_display"]) != self._mode:
             if not (loop.time() < deadline):
-                await self._confirm(objects["mode_display"], self._map.mode)
+                await self._confirm(objects["mode_display"], self._mode)
             await asyncio.sleep(0.02)

@@ -20,7 +20,18 @@ class AxisNode:
 
     @property
     def driven(self) -> bool:
+        """It holds a position."""
         return self.axis.driven
+
+    @property
+    def powered(self) -> bool:
+        """It holds a position or a force."""
+        return self.axis.powered
+
+    @property
+    def force_n(self) -> float | None:
+        """The force it holds, None for an axis that holds none."""
+        return self.axis.force_n
 
     @property
     def label(self) -> str:

@@ -33,7 +33,8 @@ class ObjectEntry:
 
 @dataclass(frozen=True)
 class PdoEntry:
-    """One PDO: communication and mapping objects, COB-ID base, transmission type, mapping words (index, sub, bits)."""
+    """One PDO: communication and mapping objects, COB-ID base, transmission type, mapping words (index, sub, bits);
+    `fields` are the names and types of what it carries."""
 
     name: str
     communication: int
@@ -41,6 +42,24 @@ class PdoEntry:
     cob: int
     transmission: int
     words: tuple[int, ...]
+    fields: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
+class ForceMode:
+    """How axes that hold a force are set up: mode and its bit in 6502h, the rated torque that the drives must state,
+    newtons at the ball in one unit of 6071h and 6072h, way of a revolution; limits in parts of the held force and of
+    the axis's speed; how fast the force goes from what the axis carries to what it shall hold."""
+
+    supported_mode_bit: int
+    mode: int
+    rated_torque_mnm: int
+    newton_per_count: float
+    mm_per_revolution: float
+    max_force: float
+    max_speed: float
+    ramp_n_s: float
+    written: tuple[tuple[str, int | str], ...]
 
 
 @dataclass(frozen=True)
@@ -62,6 +81,7 @@ class ObjectMap:
     status_bits: dict[str, int]
     emergency: dict[str, str]
     abort: dict[str, str]
+    force_mode: ForceMode
 
     def emergency_text(self, code: int) -> str:
         """The words of an emergency code: the longest matching beginning of its four digits."""
@@ -78,18 +98,22 @@ class ObjectMap:
 
 
 def _pdo(name: str, raw: dict[str, Any], objects: dict[str, ObjectEntry]) -> PdoEntry:
-    words = []
+    words, fields = [], []
     for item in raw["content"]:
         entry = objects[item if isinstance(item, str) else item["object"]]
         bits = entry.bits if isinstance(item, str) else int(item["bits"])
         words.append(entry.index << 16 | entry.sub << 8 | bits)
-    return PdoEntry(name, raw["communication"], raw["mapping"], raw["cob"], raw["transmission"], tuple(words))
+        fields.append((entry.name, f"{entry.type[0]}{bits}"))
+    head = raw["communication"], raw["mapping"], raw["cob"], raw["transmission"]
+    return PdoEntry(name, *head, tuple(words), tuple(fields))
 
 
 def parse_object_map(raw: dict[str, Any]) -> ObjectMap:
     """Build an object map from its parsed TOML; KeyError or TypeError where the data is not of this form."""
     objects = {name: ObjectEntry(name, **entry) for name, entry in raw["objects"].items()}
-    unknown = [name for name in raw["written"] if name not in objects]
+    force_mode = dict(raw["force_mode"])
+    force_written: dict[str, int | str] = force_mode.pop("written")
+    unknown = [name for name in (*raw["written"], *force_written) if name not in objects]
     if unknown or any(entry.type not in _BITS for entry in objects.values()):
         raise KeyError(f"unknown object or type {unknown}")
     return ObjectMap(
@@ -108,6 +132,7 @@ def parse_object_map(raw: dict[str, Any]) -> ObjectMap:
         status_bits=dict(raw["status_bits"]),
         emergency=dict(raw["emergency"]),
         abort=dict(raw["abort"]),
+        force_mode=ForceMode(**force_mode, written=tuple(force_written.items())),
     )
 
 
