@@ -72,6 +72,7 @@ class Drives:
         self._limited: BoolArray = np.zeros(count, np.bool_)
         self._switched: BoolArray = np.zeros(count, np.bool_)
         self._seized_brakes: dict[int, bool] = {}
+        self._own_stops: set[int] = set()
         self._brake_due: dict[int, tuple[float, bool]] = {}
         self._over_since: dict[int, float] = {}
         self._moving_limit = False
@@ -151,13 +152,21 @@ class Drives:
                 self._enter(index, Stage.SWITCH_ON_DISABLED, t_s)
             return
         target = _transition(stage, word)
-        if stage is Stage.QUICK_STOP and target is Stage.OPERATION and word == before:
+        if index in self._own_stops:
             # A drive that has stopped by itself wants to be told anew, not to hear the same word once more.
-            return
+            if word == before:
+                return
+            self._own_stops.discard(index)
         if target is Stage.QUICK_STOP:
             self.quick_stop(index, t_s)
         elif target is not None:
             self._enter(index, target, t_s)
+
+    def stop_by_itself(self, index: int, t_s: float) -> None:
+        """Ramp one enabled axis down for a reason of the drive's own."""
+        if self.stages[index] is Stage.OPERATION:
+            self._own_stops.add(index)
+            self.quick_stop(index, t_s)
 
     def quick_stop(self, index: int, t_s: float) -> None:
         """Ramp one enabled axis down; what follows depends on 605Ah."""

@@ -82,14 +82,14 @@ class DriveFaults:
         """One drive stops by itself on its quick-stop ramp and says why: its own SYNC watch, its own limit."""
         index = self._axes.index(axis)
         self._group.emergency(index, code)
-        self._group.drives.quick_stop(index, self._group.now_s())
+        self._group.drives.stop_by_itself(index, self._group.now_s())
 
     def limit_switch(self, axis: str, on: bool = True, *, stops: bool = False) -> None:
         """A limit switch trips; with `stops` the drive stops its own axis."""
         index = self._axes.index(axis)
         self._group.drives.limit_switch(index, on)
         if stops:
-            self._group.drives.quick_stop(index, self._group.now_s())
+            self._group.drives.stop_by_itself(index, self._group.now_s())
 
     def disable_voltage(self, axis: str) -> None:
         """One power stage goes off without a word: no torque, no emergency message."""
