@@ -151,8 +151,8 @@ def _check_clearance(
 
 
 def _asked(gap_mm: Array, mate: MateSettings) -> Array:
-    """Clearance asked at each gap (p,)."""
-    result: Array = np.minimum(mate.clearance_mm, 0.5 * gap_mm) - mate.contact_mm
+    """Clearance asked at each gap (p,); past the mate's face no more than contact is forgiven."""
+    result: Array = np.minimum(mate.clearance_mm, 0.5 * np.maximum(gap_mm, 0.0)) - mate.contact_mm
     return result
 
 
