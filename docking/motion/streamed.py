@@ -408,4 +408,3 @@ def _defect(error: Exception) -> DockingError:
     defect = Defect("motion", f"{type(error).__name__}: {error}")
     defect.__cause__ = error
     return defect
-

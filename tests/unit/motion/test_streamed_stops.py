@@ -1,0 +1,302 @@
+"""How the tick carries out what the arbiter decides: same cycle, all axes, escalation, brakes, silence, override."""
+
+from __future__ import annotations
+
+import asyncio
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from docking.errors import AxisDrift, AxisNotEnabled, BadArgument, DriveFault, LinkLost, StopOverdue
+from docking.motion import StreamedMotion
+from docking.motion.arbiter import Mode, Reaction
+from docking.motion.playback import Playback
+from docking.motion.stops import planned_stop
+from docking.motion.triggers import Trigger
+from docking.types import AxisState
+from sim.virtual_time import run_virtual
+from tests.support.motion_fakes import LATE_CYCLES, StreamedFake, watch_of
+from tests.support.planned_moves import a_plan, lab_site
+from tests.support.rigid_figure import path_gap_mm, rigid_gap_mm, sockets_mm
+
+SITE = lab_site()
+PLAN = a_plan(SITE, 3)
+POSITIONERS = SITE.positioners
+WHERE = POSITIONERS.origins_W_mm, POSITIONERS.axes_W
+CYCLE_S = 0.01
+OFF = (*[AxisState.ENABLED] * 4, AxisState.DISABLED, *[AxisState.ENABLED] * 7)
+
+
+class Bench:
+    """A motion side, enabled, over the fake drives."""
+
+    def __init__(self) -> None:
+        self.bus = StreamedFake(POSITIONERS.axes, np.array(PLAN.q_mm[0]))
+        self.motion = StreamedMotion(self.bus, watch_of(POSITIONERS), LATE_CYCLES)
+        self.loop = asyncio.get_running_loop()
+
+    async def begin(self):
+        await self.motion.enable()
+        await self.motion.load(PLAN)
+        return self.loop.create_task(self.motion.start(PLAN.plan_hash))
+
+
+def on_bench(scenario):
+    async def main():
+        bench = Bench()
+        result = await scenario(bench)
+        await bench.motion.close()
+        assert asyncio.all_tasks() == {asyncio.current_task()}
+        return result
+
+    return run_virtual(main)
+
+
+def test_a_finding_changes_what_is_sent_in_the_same_tick():
+    async def scenario(bench):
+        move = await bench.begin()
+        await asyncio.sleep(0.5 * PLAN.duration_s + 0.005)
+        before = np.diff(np.array(bench.bus.sent[-2:]), axis=0)[0]
+        bench.bus.changes["following_error_mm"] = 2.0 * (np.arange(12) == 4)
+        await asyncio.sleep(CYCLE_S)
+        after = np.diff(np.array(bench.bus.sent[-2:]), axis=0)[0]
+        # a_quick of 200 mm/s^2 takes more than half of 4 mm/s away within the first cycle.
+        assert np.abs(after).max() < 0.8 * np.abs(before).max()
+        await move
+
+    on_bench(scenario)
+
+
+def test_one_axis_that_leaves_makes_all_stop_by_themselves_in_the_tick_that_sees_it():
+    async def scenario(bench):
+        move = await bench.begin()
+        await asyncio.sleep(1.005)
+        sent = len(bench.bus.sent)
+        bench.bus.changes["states"] = OFF
+        await asyncio.sleep(CYCLE_S)
+        assert bench.bus.quick_stops == 1
+        assert len(bench.bus.sent) == sent, "the quick stop is this cycle's frame: set-points come after it"
+        rest = bench.bus.changes["states"] = tuple(
+            AxisState.DISABLED if state is AxisState.DISABLED else AxisState.STOPPING for state in OFF
+        )
+        result = await move
+        assert isinstance(result.cause, AxisNotEnabled)
+        assert bench.motion.arbiter.reaction is Reaction.SQS
+        sent = np.array(bench.bus.sent[sent:])
+        np.testing.assert_array_equal(sent, np.broadcast_to(sent[0], sent.shape), "path time goes on in a quick stop")
+        # What the stop left behind is no cause that keeps a reset away; enabling brings the axes back.
+        await bench.motion.reset("supervisor")
+        assert rest
+        del bench.bus.changes["states"]
+        await bench.motion.enable()
+        assert bench.motion.feedback() is not None
+
+    on_bench(scenario)
+
+
+def test_ramps_are_armed_in_proportion_before_every_move():
+    async def scenario(bench):
+        await bench.motion.enable()
+        await bench.motion.load(PLAN)
+        ((peak, t_stop_s),) = bench.bus.armed
+        np.testing.assert_allclose(peak, np.abs(np.diff(PLAN.q_mm, axis=0)).max(axis=0) / PLAN.period_s)
+        assert t_stop_s == pytest.approx(max(peak.max() / 200.0, CYCLE_S))
+
+    on_bench(scenario)
+
+
+def test_a_stop_on_the_path_that_does_not_end_becomes_a_quick_stop_then_silence():
+    async def scenario(bench):
+        move = await bench.begin()
+        await asyncio.sleep(1.0)
+        playback = bench.motion._move.playback
+        playback.hold = playback.stop_straight = lambda *_: None
+        # Path time cannot be stopped, and the drives do not come to rest either: the positions go on by themselves.
+        bench.motion.request("stop")
+        begun_s, silent_s = bench.loop.time(), None
+        quick_s = None
+        for cycle in range(400):
+            await asyncio.sleep(CYCLE_S)
+            if quick_s is None and bench.bus.quick_stops:
+                quick_s = bench.loop.time() - begun_s
+            if quick_s is not None:
+                bench.bus.offset_mm = np.full(12, 0.01 * (cycle % 2))
+            if silent_s is None and bench.bus.silent:
+                silent_s = bench.loop.time() - begun_s
+                break
+        stop = planned_stop(PLAN, bench.bus.a_quick_mm_s2, CYCLE_S)
+        assert quick_s == pytest.approx(1.5 / PLAN.rate_slew_per_s + 3 * CYCLE_S, abs=2.0 * CYCLE_S)
+        assert silent_s - quick_s == pytest.approx(stop.t_stop_s + 0.1, abs=2.0 * CYCLE_S)
+        result = await move
+        assert result.result == "fault"
+        assert isinstance(result.cause, StopOverdue)
+        sent = len(bench.bus.sent)
+        await asyncio.sleep(1.0)
+        assert len(bench.bus.sent) == sent, "silence means silence"
+        with pytest.raises(StopOverdue):
+            await bench.motion.enable()
+
+    on_bench(scenario)
+
+
+def test_a_lost_link_ends_in_silence():
+    async def scenario(bench):
+        move = await bench.begin()
+        await asyncio.sleep(1.0)
+        bench.bus.error = LinkLost("can0", "bus off")
+        result = await move
+        assert isinstance(result.cause, LinkLost)
+        assert bench.bus.silent
+        assert bench.motion.arbiter.reaction is Reaction.HW
+
+    on_bench(scenario)
+
+
+@pytest.mark.parametrize("brakes_hold", [True, False])
+def test_an_axis_that_drifts_at_rest_is_braked_with_all_others(brakes_hold):
+    async def scenario(bench):
+        if not brakes_hold:
+            bench.bus.brake_s = 60.0
+        await bench.motion.enable()
+        await asyncio.sleep(0.5)
+        for step in range(30):
+            bench.bus.offset_mm = 0.002 * step * (np.arange(12) == 2)
+            await asyncio.sleep(CYCLE_S)
+        with pytest.raises(AxisDrift):
+            bench.motion.feedback()
+        assert bench.bus.quick_stops == 1
+        await asyncio.sleep(3.0)
+        assert bench.bus.brakes == (1 if brakes_hold else 0)
+        assert bench.bus.silent is not brakes_hold, "brakes that are not confirmed open the hardware chain"
+        if brakes_hold:
+            assert bench.motion.arbiter.mode is Mode.OFF
+
+    on_bench(scenario)
+
+
+def test_a_drive_that_complains_does_not_hide_one_that_left():
+    async def scenario(bench):
+        move = await bench.begin()
+        await asyncio.sleep(1.0)
+        bench.bus.changes |= {"fault": ("A.X", 0x4210, "drive too hot"), "states": OFF}
+        result = await move
+        assert isinstance(result.cause, DriveFault | AxisNotEnabled)
+        assert bench.bus.quick_stops == 1
+
+    on_bench(scenario)
+
+
+def test_an_operators_stop_is_no_fault():
+    async def scenario(bench):
+        move = await bench.begin()
+        await asyncio.sleep(1.0)
+        bench.motion.request("stop")
+        assert bench.motion.arbiter.reaction is Reaction.PPS
+        assert (await move).result == "stopped"
+        arbiter = bench.motion.arbiter
+        assert (arbiter.reaction, arbiter.mode, arbiter.latched) == (Reaction.NONE, Mode.STANDING, False)
+        assert Trigger.OPERATOR_STOP not in {f.trigger for f in arbiter.later}
+
+    on_bench(scenario)
+
+
+def test_lateness_is_counted():
+    async def scenario(bench):
+        await bench.motion.enable()
+        await asyncio.sleep(1.0)
+        assert bench.motion.lateness.samples == pytest.approx(100, abs=2)
+        bench.loop._now += 0.05
+        await asyncio.sleep(0.1)
+        assert bench.motion.lateness.worst_s == pytest.approx(0.05, abs=0.011)
+
+    on_bench(scenario)
+
+
+@pytest.mark.parametrize("bad", [-1.0, 100.1, float("nan"), float("inf")])
+def test_an_impossible_override_is_refused(bad):
+    async def scenario(bench):
+        with pytest.raises(BadArgument):
+            bench.motion.override(bad)
+
+    on_bench(scenario)
+
+
+def test_the_override_outlasts_a_hold_and_the_move():
+    async def scenario(bench):
+        move = await bench.begin()
+        await asyncio.sleep(1.0)
+        bench.motion.override(50.0)
+        await asyncio.sleep(1.5 / PLAN.rate_slew_per_s)
+        playback = bench.motion._move.playback
+        assert playback.rate == 0.5
+        bench.motion.request("hold")
+        bench.motion.override(25.0)
+        await asyncio.sleep(2.0)
+        assert playback.standing
+        bench.motion.request("resume")
+        await asyncio.sleep(2.0 / PLAN.rate_slew_per_s)
+        assert playback.rate == 0.25
+        bench.motion.override(100.0)
+        assert (await move).result == "done"
+        np.testing.assert_array_equal(bench.bus.sent[-1], PLAN.q_mm[-1])
+        bench.motion.override(30.0)
+        back = a_plan(SITE, 4, start_mm=np.array(PLAN.q_mm[-1]))
+        await bench.motion.load(back)
+        begun_s = bench.loop.time()
+        await bench.motion.start(back.plan_hash)
+        assert bench.loop.time() - begun_s == pytest.approx(back.duration_s / 0.3, rel=0.02)
+
+    on_bench(scenario)
+
+
+VERBS = st.lists(
+    st.tuples(
+        st.integers(1, 60),
+        st.one_of(
+            st.just("hold"), st.just("resume"), st.just("fast"), st.floats(0.0, 1.0).map(lambda share: f"{share:.3f}")
+        ),
+    ),
+    max_size=12,
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(verbs=VERBS)
+def test_hold_resume_override_and_stops_change_the_rate_never_the_path(verbs):
+    playback = Playback(PLAN)
+    slew = planned_stop(PLAN, POSITIONERS.a_quick_mm_s2, CYCLE_S).fast_slew_per_s
+    sent, rates = [np.array(PLAN.q_mm[0])], [1.0]
+    for cycles, verb in [(5, "resume"), *verbs]:
+        if verb == "fast":
+            playback.stop_straight(slew)
+        elif verb in ("hold", "resume"):
+            getattr(playback, verb)()
+        else:
+            playback.override(float(verb))
+        for _ in range(cycles):
+            sent.append(playback.advance(CYCLE_S))
+            rates.append(playback.rate)
+    table, path = np.array(sent), np.array(rates)
+    assert rigid_gap_mm(sockets_mm(*WHERE, PLAN.q_mm[0])[0], sockets_mm(*WHERE, table)).max() <= 1e-6
+    assert path_gap_mm(PLAN.q_mm, table[:: max(1, len(table) // 60)]).max() <= 1e-4
+    assert path.min() >= 0.0
+    assert path.max() <= 1.0
+    bend = np.abs(np.diff(table, 2, axis=0)) / CYCLE_S**2
+    assert (bend <= POSITIONERS.a_quick_mm_s2 * 1.001).all()
+
+
+def test_a_straight_stop_is_as_hard_as_the_axes_can_and_as_short():
+    for share in (0.2, 0.5, 0.8):
+        playback = Playback(PLAN)
+        stop = planned_stop(PLAN, POSITIONERS.a_quick_mm_s2, CYCLE_S)
+        while playback.path_time_s < share * PLAN.duration_s:
+            playback.advance(CYCLE_S)
+        begun = playback.path_time_s
+        playback.stop_straight(stop.fast_slew_per_s)
+        while not playback.standing:
+            playback.advance(CYCLE_S)
+        # v t / 2 of the fastest axis, rounded up to the cycle.
+        assert playback.path_time_s - begun <= 0.5 / stop.fast_slew_per_s + CYCLE_S
+    assert 1.0 / stop.fast_slew_per_s == pytest.approx(float((stop.peak_mm_s / 200.0).max()), rel=0.02)
