@@ -138,6 +138,7 @@ def moved_record(plan: Plan, result: MoveResult) -> dict[str, Any]:
             "residual_mm": trace.residual_mm.tolist(),
             "internal_force_n": trace.internal_force_n.tolist(),
             "force_n": _by_axis(plan.axes, trace.force_n),
+            "measured_force_n": np.round(trace.measured_force_n, 1).tolist(),
         },
         "max_following_error_mm": dict(zip(plan.axes, result.max_following_error_mm.tolist(), strict=True)),
         "max_consistency_residual_mm": result.max_residual_mm,

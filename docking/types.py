@@ -327,7 +327,8 @@ class Identity:
 @dataclass(frozen=True, eq=False)
 class Trace:
     """What was recorded during a move, one row a recorded cycle (n): times, positions and following errors (n, m),
-    consistency residual (n,), predicted internal force (n,), measured force along each axis (n, m; NaN = none)."""
+    consistency residual (n,), predicted internal force (n,), measured force along each axis (n, m; NaN = none), largest
+    measured internal force at a ball since the move was loaded (n,; NaN = none)."""
 
     t_s: Array
     path_time_s: Array
@@ -336,6 +337,7 @@ class Trace:
     residual_mm: Array
     internal_force_n: Array
     force_n: Array
+    measured_force_n: Array
 
 
 @dataclass(frozen=True, eq=False)

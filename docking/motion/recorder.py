@@ -7,7 +7,7 @@ import numpy as np
 from docking.motion.monitors import Watch
 from docking.types import Array, Feedback, MoveResult, Trace
 
-_Row = tuple[float, float, Array, Array, float, float, Array]
+_Row = tuple[float, float, Array, Array, float, float, Array, float]
 
 
 class Recorder:
@@ -30,6 +30,7 @@ class Recorder:
             watch.residual_mm,
             watch.internal_force_n,
             feedback.force_n,
+            watch.measured_force_n,
         )
         if self._count % self._every == 0:
             self._rows.append(self._last)
@@ -41,7 +42,7 @@ class Recorder:
         if self._last is not None and self._rows[-1] is not self._last:
             self._rows.append(self._last)
         columns = [np.array(column, dtype=np.float64) for column in zip(*self._rows, strict=True)] or [
-            np.zeros(0) if k in (0, 1, 4, 5) else np.zeros((0, len(commanded_mm))) for k in range(7)
+            np.zeros(0) if k in (0, 1, 4, 5, 7) else np.zeros((0, len(commanded_mm))) for k in range(8)
         ]
         return MoveResult(
             result=outcome,

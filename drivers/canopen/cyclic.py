@@ -22,6 +22,8 @@ _FRAME = codec.SET_POINT.itemsize
 _NEVER = -1_000_000
 FORCE_PERIODS = 3
 """Periods of the load-cell frames after which a force that was not repeated is forgotten."""
+NO_FORCE = -32768
+"""The most negative count: the load cell's amplifier cannot measure."""
 _NAN = float("nan")
 
 
@@ -196,7 +198,8 @@ class CyclicImage:
             if self._force_cycle != self.cycles:
                 # A new array a cycle: an earlier feedback keeps the one it was given.
                 self._force, self._force_cycle = self._force.copy(), self.cycles
-            self._force[index] = int.from_bytes(data, "little", signed=True) * self._map.newton_per_count
+            counts = int.from_bytes(data, "little", signed=True)
+            self._force[index] = _NAN if counts == NO_FORCE else counts * self._map.newton_per_count
             self._force_seen[index] = self.cycles
             return True
         return False

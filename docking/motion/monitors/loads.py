@@ -33,8 +33,8 @@ class BallLoads:
     """Judges load-cell readings (m,), force on the component along each axis, once a sample.
 
     `weighed` (m,) axes with a load cell. Linearised about the place given to `about`; a violation counts when two
-    samples in a row show it, a silent cell at once. `force_n` and `warp_n` are the newest measured internal force (largest
-    ball) and warp against the tare, `whole_force_n` and `whole_warp_n` as a whole; NaN before any.
+    samples in a row show it, a silent cell at once. `force_n` and `warp_n` are the newest measured internal force (at
+    the worst ball) and warp against the tare, `whole_force_n` and `whole_warp_n` as a whole; NaN before any.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class BallLoads:
         self._positioners, self._load, self._limits, self._margins = positioners, load, limits, margins
         self._axes, self._weighed = positioners.axes, weighed
         self._rated_n = limits.rating * np.asarray(positioners.rated_n, dtype=np.float64).reshape(-1)
-        self._whole = weighed.reshape(-1, 3).all(axis=1)
+        self._whole: NDArray[np.bool_] = np.all(weighed.reshape(-1, 3), axis=1)
         self._rest: deque[Array] = deque(maxlen=TARE_SAMPLES)
         self._ready = self._relief = False
         self.forget()
@@ -112,7 +112,7 @@ class BallLoads:
         if force_n is self._seen:
             return self._finding
         self._seen = force_n
-        missing = np.isnan(force_n) & self._weighed
+        missing = ~np.isfinite(force_n) & self._weighed
         if missing.any():
             k = int(np.argmax(missing))
             self._finding = Finding(Trigger.FORCE_MISSING, LoadCellSilent(self._axes[k]))

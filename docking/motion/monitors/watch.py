@@ -149,12 +149,14 @@ class Watch:
         elif finding is None:
             self._late_in_a_row = 0
             led = not (may_stop and AxisState.STOPPING in feedback.states)
-            finding = (
-                self._travel.judge(feedback, q_ref_mm, moving=moving, led=led)
-                or self._figure(feedback.position_mm, q_ref_mm)
-                or self._loads.judge(feedback.force_n, feedback.t_s, q_ref_mm, moving=moving)
-                or self._travel.following(feedback.following_error_mm, speed_mm_s)
+            # All are judged, whatever the first finds: the maxima and the trace go on through a stop.
+            found = (
+                self._travel.judge(feedback, q_ref_mm, moving=moving, led=led),
+                self._figure(feedback.position_mm, q_ref_mm),
+                self._loads.judge(feedback.force_n, feedback.t_s, q_ref_mm, moving=moving),
+                self._travel.following(feedback.following_error_mm, speed_mm_s),
             )
+            finding = found[0] or found[1] or found[2] or found[3]
         finding = finding or self._told(feedback)
         self._clean = (feedback, q_ref_mm) if finding is None else None
         return finding

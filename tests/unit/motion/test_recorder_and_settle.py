@@ -38,7 +38,7 @@ def test_one_row_every_few_cycles_the_first_and_the_last_included():
     assert trace.position_mm.shape == trace.following_error_mm.shape == trace.force_n.shape == (11, 12)
     np.testing.assert_allclose(trace.position_mm[3], np.arange(12.0) + 30)
     np.testing.assert_allclose(trace.force_n[4], 400.0)
-    assert trace.residual_mm.shape == trace.internal_force_n.shape == (11,)
+    assert trace.residual_mm.shape == trace.internal_force_n.shape == trace.measured_force_n.shape == (11,)
     # The maximum is over all cycles, also those without a row.
     np.testing.assert_allclose(result.max_following_error_mm, 0.094)
 
