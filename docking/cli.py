@@ -29,6 +29,7 @@ from docking.words import tell
 
 EXIT_OF_OUTCOME = {
     "docked": EXIT_OK,
+    "relieved": EXIT_OK,
     "out_of_tolerance": EXIT_OUT_OF_TOLERANCE,
     "stopped": EXIT_STOPPED,
     "fault": EXIT_FAULT,
@@ -95,6 +96,43 @@ def check(cell: Path, job: Path | None, as_json: bool) -> int:
     return EXIT_OK
 
 
+@cli.command()
+@click.argument("cell", type=FILE)
+@click.argument("job", type=FILE, required=False)
+@click.option(
+    "--from", "start", metavar="X,Y,Z,A,B,G", help="Start so far off the first station: mm along W, deg about the face."
+)
+@click.option("--seed", type=SEED, help="Draw the start inside the guard of the first correction instead.")
+@click.option("--plot", type=FILE, help="Draw every axis along the paths into this HTML file.")
+@_json_option
+def plan(cell: Path, job: Path | None, start: str | None, seed: int | None, plot: Path | None, as_json: bool) -> int:
+    """Plan and check every move of a job without connecting or moving anything.
+
+    Says for each stage how far every axis goes, what is left to its limits, which limit sets the speed, and what one
+    jammed axis would do to the part. A refused move exits with 1 and names what would fit.
+
+    \b
+    Example: docking plan sim/cells/fuselage-can.toml --from 15,-10,5,0.2,0,-0.3 --plot plan.html
+    """
+    from docking.preview import head_text, move_text, open_preview, preview_json
+
+    preview = open_preview(cell, job, start, seed)
+    moves = []
+    if not as_json:
+        _print(head_text(preview))
+    for move in preview.moves():
+        moves.append((move, move_text(move)))
+        if not as_json:
+            _print(moves[-1][1])
+    if plot is not None:
+        from docking.report.plan_page import write_plan_page
+
+        write_plan_page(f"Plan of {preview.cell.name}", head_text(preview), moves, plot)
+    if as_json:
+        _print_json(preview_json(preview, [move for move, _ in moves]))
+    return EXIT_OK
+
+
 @cli.command("dry-run")
 @click.argument("cell", type=FILE)
 @click.argument("job", type=FILE, required=False)
@@ -151,9 +189,45 @@ def run(as_json: bool, step: bool, sim: bool, wires: Path | None, **request: Any
 @cli.command()
 @click.argument("cell", type=FILE)
 @click.argument("job", type=FILE, required=False)
+@click.option("--supervisor", required=True, help="Who asks for every step; the name goes to the journal.")
+@click.option("--after", type=FILE, help="Journal of the run that left the part strained: its weighing is the zero.")
+@click.option("--sim", is_flag=True, help="Use simulated devices on real wires.")
+@click.option("--wires", type=FILE, help="Addresses that `docking sim` wrote; without it --sim starts its own devices.")
+@click.option("--seed", type=SEED, default=1, show_default=True, help="Seed of the simulated errors (with --sim).")
+@click.option("--journal", type=FILE, help="Keep the journal in this file (default: temporary).")
+@_json_option
+def relieve(as_json: bool, supervisor: str, after: Path | None, sim: bool, wires: Path | None, **request: Any) -> int:
+    """Take the strain out of a part that a stop or fault has left on the balls, by small steps of single axes.
+
+    \b
+    Every step (0.05 mm at 0.1 mm/s at most) is asked for by a supervisor at the terminal; it ends when a force rises.
+    Example: docking relieve cell.toml job.toml --supervisor "A. Smith" --after runs/part.journal.jsonl
+    """
+    from docking import assemble
+
+    if not supervisor.strip():
+        raise BadArgument("--supervisor", "who asks for the steps must have a name", value=supervisor)
+    if wires is not None and not sim:
+        raise BadArgument("--wires", "addresses of simulated devices need --sim", value=str(wires))
+    run = assemble.RunRequest(request["cell"], request["job"], request["seed"], None, request["journal"], language())
+    wanted = assemble.ReliefRequest(run, supervisor.strip(), after)
+    summary = assemble.relieve(wanted, assemble.WireChoice(sim, wires), _say(as_json))
+    if as_json:
+        _print_json(summary)
+    else:
+        _print(tell(language(), summary["outcome"]))
+        if summary["internal_force_n"] is not None:
+            _print(tell(language(), "relief", **summary))
+    return EXIT_OF_OUTCOME[summary["outcome"]]
+
+
+@cli.command()
+@click.argument("cell", type=FILE)
+@click.argument("job", type=FILE, required=False)
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Seed of the simulated errors.")
 @click.option("--wires", type=FILE, help="Write the addresses of the wires to this JSON file.")
-def sim(cell: Path, job: Path | None, seed: int, wires: Path | None) -> int:
+@click.option("--trace", type=FILE, help="Record commanded and actual position of every axis in this CSV file, 100 Hz.")
+def sim(cell: Path, job: Path | None, seed: int, wires: Path | None, trace: Path | None) -> int:
     """Serve the simulated devices of a cell on real wires until interrupted.
 
     \b
@@ -161,7 +235,7 @@ def sim(cell: Path, job: Path | None, seed: int, wires: Path | None) -> int:
     """
     from docking import assemble
 
-    assemble.serve(assemble.RunRequest(cell, job, seed, None, None, language()), wires, _say(False))
+    assemble.serve(assemble.RunRequest(cell, job, seed, None, None, language()), wires, _say(False), trace)
     return EXIT_OK
 
 

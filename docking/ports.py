@@ -88,25 +88,49 @@ class StreamedPositioners(Protocol):
 
 
 class QueuedPositioners(Protocol):
-    """Axes whose controllers play a queue of segments after one common start (Modbus positioner PLCs)."""
+    """Axes whose controllers play a queue of segments after one common start (Modbus positioner PLCs).
+
+    `ramp_s` and `quick_ramp_s`: how long a stop takes from full rate; `braked`: the driven axes report closed brakes.
+    `on_lost` is called when the connection to a controller breaks, whether anybody waits for an answer or not.
+    """
 
     axes: tuple[str, ...]
     segment_s: float
+    ramp_s: float
+    on_lost: Callable[[], None]
+
+    @property
+    def quick_ramp_s(self) -> float: ...
+
+    @property
+    def braked(self) -> bool: ...
 
     async def bring_up(self) -> tuple[Identity, ...]: ...
 
     async def enable(self) -> Feedback: ...
 
     async def load(self, plan: Plan) -> None:
-        """Clear the queues and fill them with the start of `plan` (rows on a grid of `segment_s`). Nothing moves."""
+        """Clear the queues and fill them with the start of `plan` (rows on a grid of `segment_s`); set the quick ramp
+        for its speeds. Nothing moves."""
         ...
 
     async def command(self, verb: str) -> None:
-        """One of `run`, `hold`, `resume`, `stop`, `quick-stop`: acknowledged by all or OutcomeUnknown."""
+        """One of `run`, `hold`, `resume`, `stop`, `quick-stop`, `reset`: acknowledged by all or OutcomeUnknown."""
         ...
 
-    async def poll(self) -> Feedback:
-        """Keep the queues filled and the heartbeats alive; return one read-back of all axes."""
+    async def override(self, rate: float) -> None:
+        """At standstill: the playback rate (over 0, to 1) from the next run or resume on."""
+        ...
+
+    async def poll(self, *, surviving: bool = False) -> Feedback:
+        """Keep the queues filled and the heartbeats alive; return one read-back of all axes.
+
+        `surviving`: controllers that do not answer are only shown as old, nothing is raised for them.
+        """
+        ...
+
+    def go_silent(self) -> None:
+        """End all heartbeats for good: the controllers' watchdogs act. Never waits, never raises."""
         ...
 
     async def close(self) -> None: ...
@@ -116,6 +140,8 @@ class Motion(Protocol):
     """All the cell knows of motion: load a table, start it, hold, resume or stop on the path, see where it stands."""
 
     axes: tuple[str, ...]
+    speed_limit_mm_s: float
+    """The fastest move that the motion side bears, known after `connect`: how late its ticks come decides it."""
 
     async def connect(self) -> tuple[Identity, ...]:
         """Prove every positioner: identity, settings, watchdogs."""

@@ -261,7 +261,7 @@ class Procedure:
             kind=p.kind,
             q_now_mm=self._where_axes_are(),
             correction=correction,
-            speed_mm_s=station.speed_mm_s,
+            speed_mm_s=min(station.speed_mm_s, self.motion.speed_limit_mm_s),
             period_s=self._settings.period_s,
             linear_interpolation=self._settings.linear_interpolation,
             scene=self._approach.scene(self._component_fit(), self._mate_fit(), station),

@@ -209,6 +209,7 @@ class Drives(Model):
     follower_friction: NonNegative = 0.005
     sync_loss: Literal["hold", "ignore", "extrapolate", "quick-stop", "fault"]
     sync_loss_cycles: Positive = 3.0
+    watchdog_scatter_s: NonNegative = 0.0
 
 
 class InstrumentTruth(Model):

@@ -25,6 +25,7 @@ from docking.errors import BadArgument, FileUnreadable, FileUnwritable
 from docking.journal import JournalFile, read
 from docking.operators import AutomaticOperator, TerminalOperator
 from docking.ports import Journal, Motion, Operator, at_once
+from docking.procedure import Procedure
 from docking.progress import Progress
 from docking.records import alarm_record
 from docking.state import Event, State
@@ -135,16 +136,20 @@ def run_on_wires(request: RunRequest, choice: WireChoice, say: Say, *, step: boo
         return _finish(request, path, run_real(main, ticks=own_devices))
 
 
-def serve(request: RunRequest, wires_file: Path | None, say: Say) -> None:
-    """Serve the simulated devices of a cell on real wires until interrupted."""
+def serve(request: RunRequest, wires_file: Path | None, say: Say, trace: Path | None = None) -> None:
+    """Serve the simulated devices of a cell on real wires until interrupted; `trace` records how the axes move."""
     files = load_files(request)
-    if wires_file is not None:
-        _prepare(wires_file)
+    for path in (wires_file, trace):
+        if path is not None:
+            _prepare(path)
     with tempfile.TemporaryDirectory(prefix="docking-sim-") as folder:
 
         async def main() -> None:
             far = make_far_end(files.cell, files.job, truth_of(request.cell_path), request.seed)
             found = await real_wires(files.cell, far, Path(folder))
+            if trace is not None:
+                with _writing(trace):
+                    far.trace(trace)
             asked_to_end = asyncio.Event()
             on_interrupt(asked_to_end.set)
             text = json.dumps(found, indent=2)
@@ -229,7 +234,7 @@ async def _joined_motion(run: _Run, joined: _Joined, journal: Journal) -> Motion
     return await joined.process.join((run.request.cell_path, files.job_path), files.cell, joined.found, hear)
 
 
-def _abort(cell: Cell, operator: Operator) -> None:
+def _abort(cell: Cell[Procedure], operator: Operator) -> None:
     operator.notify("interrupted")
     cell.post(Event.ABORT)
 
@@ -262,7 +267,7 @@ def _started(run: _Run) -> dict[str, Any]:
     }
 
 
-def _summary(run: _Run, cell: Cell, state: State, times_s: tuple[float, float]) -> dict[str, Any]:
+def _summary(run: _Run, cell: Cell[Procedure], state: State, times_s: tuple[float, float]) -> dict[str, Any]:
     """The object that `--json` prints."""
     p: Progress = cell.procedure.progress
     outcome = OUTCOMES[state]

@@ -17,6 +17,7 @@ from sim.canopen.settings import DriveSettings
 from sim.instrument import Instrument
 from sim.plant import Plant
 from sim.plc.group import PlcGroup
+from sim.trace import AxisTrace
 from sim.tracker.geocom import GeocomStation
 from sim.tracker.line import LineTrackerDevice
 from sim.truth import TruthFile, load_truth
@@ -58,7 +59,10 @@ class FarEnd:
         """Put the drives on a CAN bus."""
         drives = self.truth.drives
         settings = DriveSettings(
-            sync_loss=drives.sync_loss, sync_loss_cycles=drives.sync_loss_cycles, shared_cpu=shared_cpu
+            sync_loss=drives.sync_loss,
+            sync_loss_cycles=drives.sync_loss_cycles,
+            shared_cpu=shared_cpu,
+            watchdog_scatter_s=drives.watchdog_scatter_s,
         )
         group = DriveGroup(self.plant, cell, settings, wire, self.loop)
         group.start()
@@ -72,6 +76,11 @@ class FarEnd:
         group = PlcGroup(self.plant, cell, [self.plant.clock_ppm[n] for n in names], self.loop, late_s)
         self.devices.append(group)
         return await group.serve(addresses)
+
+    def trace(self, path: Path) -> None:
+        """Record where the axes are commanded and where they stand. Raises OSError."""
+        bus = next(d for d in self.devices if isinstance(d, DriveGroup | PlcGroup))
+        self.devices.append(AxisTrace(path, self.plant, bus.heard_s, self.loop))
 
     async def close(self) -> None:
         """Stop the devices."""

@@ -83,7 +83,7 @@ class ModbusBus(Model):
         default=0.05, description="longest time one reply may take, s"
     )
     watchdog_s: Annotated[float, Field(ge=0.05, le=2.0)] = Field(
-        default=0.2, description="a PLC stops by itself when the host is silent this long, s"
+        default=0.12, description="a PLC stops by itself when the host is silent this long, s"
     )
     ramp_s: Annotated[float, Field(ge=0.05, le=5.0)] = Field(
         default=0.5, description="playback rate 1 -> 0 on hold or stop, s"

@@ -83,6 +83,10 @@ class DriveGroup:
         self._link.open()
         self._transmit([node.boot_up() for node in self.nodes])
 
+    def heard_s(self) -> float:
+        """When the controller's heartbeat came last; NaN before the first."""
+        return self._heartbeats.heard_s
+
     def close(self) -> None:
         """Stop all timers."""
         self._heartbeats.close()

@@ -13,7 +13,10 @@ _ROUNDING_S = 1e-9
 
 
 class Heartbeats:
-    """One timer for all nodes. `lost(node)` and `returned(node)` tell of the controller's heartbeat."""
+    """One timer for all nodes. `lost(node)` and `returned(node)` tell of the controller's heartbeat.
+
+    `heard_s` is when the controller's heartbeat came last, NaN before the first.
+    """
 
     def __init__(
         self,
@@ -27,6 +30,7 @@ class Heartbeats:
         self._lost, self._returned = lost, returned
         self._deadlines: dict[int, float] = {}
         self._gone: set[int] = set()
+        self.heard_s = math.nan
         self._timer: asyncio.TimerHandle | None = None
 
     def produce(self, node: Node, interval_s: float) -> None:
@@ -43,7 +47,7 @@ class Heartbeats:
 
     def heard(self, host: int, listeners: list[Node]) -> None:
         """The controller's heartbeat: monitoring begins with the first one (CiA 301) and is renewed by each."""
-        now_s = self._loop.time()
+        now_s = self.heard_s = self._loop.time()
         begins = False
         for node in listeners:
             if node.host != host:

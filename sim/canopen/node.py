@@ -58,7 +58,8 @@ class Node:
     def refresh_host(self) -> None:
         """Take over 1016h: `host` is the node id whose heartbeat this node monitors, 0 for none."""
         consumer = self.number_of(0x1016, 1)
-        self.host, self.host_timeout_s = consumer >> 16 & 0x7F, (consumer & 0xFFFF) * 1e-3
+        self.host, wait_s = consumer >> 16 & 0x7F, (consumer & 0xFFFF) * 1e-3
+        self.host_timeout_s = max(0.0, wait_s + self._settings.watchdog_offset_s(self.number)) if wait_s else 0.0
 
     @property
     def answers_sdo(self) -> bool:

@@ -100,6 +100,10 @@ class PlcGroup:
             await server.wait_closed()
         self._servers.clear()
 
+    def heard_s(self) -> float:
+        """When a heartbeat of the host came last to any PLC; NaN before the first."""
+        return max((plc.heard_s for plc in self.plcs if plc.heard_s == plc.heard_s), default=float("nan"))
+
     def drop_connections(self, name: str) -> None:
         """Cut every connection to the positioner `name` (fault injection)."""
         plc = self._plc_of(name)

@@ -202,6 +202,11 @@ class PositionerPlc:
         return self.state in POWERED
 
     @property
+    def heard_s(self) -> float:
+        """When the host's heartbeat changed last; NaN before the first."""
+        return self._heartbeat_s if self._heartbeat_seen else float("nan")
+
+    @property
     def _watchdog_armed(self) -> bool:
         return self.settings.watchdog_ms > 0 and self._heartbeat_seen
 

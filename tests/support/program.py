@@ -52,7 +52,7 @@ def on_an_ordinary_computer(folder: Path, name: str) -> Path:
         (".sim.toml", 'sync_loss = "quick-stop"\n', 'sync_loss = "quick-stop"\nsync_loss_cycles = 25.0\n'),
     ]
     if name.endswith("-modbus"):
-        changes.append((".toml", "\ntimeout_s = 0.05\nwatchdog_s = 0.2\n", "\ntimeout_s = 0.2\nwatchdog_s = 0.5\n"))
+        changes.append((".toml", "\ntimeout_s = 0.05\nwatchdog_s = 0.12\n", "\ntimeout_s = 0.2\nwatchdog_s = 0.5\n"))
     return cell_copy(folder, name, *changes)
 
 
