@@ -7,12 +7,15 @@ from pathlib import Path
 from typing import Any
 
 from docking.config.budget import feature_budget, least_risk
+from docking.config.build import positioners_from, rank_settings
 from docking.config.cell import CellFile
 from docking.config.cross_check import check_cell, check_job
 from docking.config.describe import describe
 from docking.config.findings import Finding, Severity
 from docking.config.job import JobFile
 from docking.config.load import default_job_path, file_sha256, load_cell, load_job
+from docking.config.torque_off import strain_json
+from docking.kinematics import conditioning
 
 __all__ = ["CheckResult", "check_cell", "check_files", "check_job"]
 
@@ -46,6 +49,8 @@ class CheckResult:
             },
             "axes": list(self.cell.axis_names),
             "driven": [name for name, on in zip(self.cell.axis_names, self.cell.driven, strict=True) if on],
+            **self._held(),
+            **strain_json(self.cell, self.job),
             "features": [
                 {
                     "name": budget.name,
@@ -58,6 +63,10 @@ class CheckResult:
             "expected_risk": least_risk(self.cell, self.job, self.job.measuring.max_passes),
             "warnings": [{"file": str(path), "key": f.key, "text": f.text} for path, f in self.warnings],
         }
+
+    def _held(self) -> dict[str, Any]:
+        found = conditioning(positioners_from(self.cell, self.job), rank_settings(self.cell))
+        return {"redundancy": found.redundancy, "condition": found.condition}
 
 
 def check_files(cell_path: Path, job_path: Path | None = None) -> CheckResult:

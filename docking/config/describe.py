@@ -9,6 +9,7 @@ from docking.config.build import load_from, positioners_from, rank_settings
 from docking.config.cell import CanBus, CellFile
 from docking.config.job import JobFile
 from docking.config.support import stage_positions
+from docking.config.torque_off import strain_text
 from docking.geometry import pose_to_vector
 from docking.kinematics import conditioning, reaction_extremes
 from docking.kinematics.forces import ball_reactions_n
@@ -23,9 +24,8 @@ def describe(cell: CellFile, job: JobFile) -> str:
         f"{len(job.component.targets)} targets, {len(job.component.check_points)} check points, "
         f"{len(job.mate.targets)} mate targets",
     ]
-    return "\n".join(
-        [*head, "", *_axes(cell, job), "", *_reactions(cell, job), "", *_stages(job), "", *_proof(cell, job)]
-    )
+    parts = (_axes(cell, job), _reactions(cell, job), strain_text(cell, job), _stages(job), _proof(cell, job))
+    return "\n\n".join("\n".join(rows) for rows in (head, *parts))
 
 
 def _instrument(cell: CellFile) -> str:
