@@ -44,6 +44,7 @@ class Travel:
         self._axes, self._limits, self._timing, self._margins = positioners.axes, limits, timing, margins
         self._driven = np.asarray(positioners.driven, dtype=bool)
         self._free = ~self._driven
+        self._unpowered = np.asarray(~positioners.powered, dtype=bool)
         self._any_free = bool(self._free.any())
         v_max = np.asarray(positioners.v_mm_s, dtype=np.float64)
         self._slope = (limits.following_vmax_mm - limits.following_rest_mm) / v_max
@@ -172,7 +173,8 @@ class Travel:
         np.maximum(self._size, _FLOOR_MM, out=self._size)
         off /= self._size
         if self._any_free:
-            off[self._free] = 0.0
+            # An axis that holds a force jams as a driven one does: it has to go where the plan takes the component.
+            off[self._unpowered] = 0.0
         if self._margins.note("command_against_encoder", float(off.max()) / _SPREAD):
             return None
         k = int(np.argmin(off <= _SPREAD))

@@ -18,6 +18,7 @@ from docking.errors import (
     WarpTrip,
 )
 from docking.kinematics import Coupling, CouplingMonitor, Load, Positioners, coupling_monitor, socket_positions
+from docking.motion.monitors.held import HeldForces
 from docking.motion.monitors.limits import Margins, Timing, WatchLimits
 from docking.motion.monitors.loads import BallLoads
 from docking.motion.monitors.travel import Travel
@@ -53,6 +54,7 @@ class Watch:
         self._travel = Travel(positioners, limits, timing or Timing(), self._margins)
         weighed = np.asarray(load_cells, dtype=np.bool_)
         self._loads = BallLoads(positioners, load, limits, weighed, self._margins)
+        self._held = HeldForces(positioners, weighed, self._margins)
         self._coupling: CouplingMonitor | None = None
         self._enabled: tuple[AxisState, ...] = ()
         self._late_in_a_row = 0
@@ -155,8 +157,9 @@ class Watch:
                 self._figure(feedback.position_mm, q_ref_mm),
                 self._loads.judge(feedback.force_n, feedback.t_s, q_ref_mm, moving=moving),
                 self._travel.following(feedback.following_error_mm, speed_mm_s),
+                self._held.judge(feedback),
             )
-            finding = found[0] or found[1] or found[2] or found[3]
+            finding = found[0] or found[1] or found[2] or found[3] or found[4]
         finding = finding or self._told(feedback)
         self._clean = (feedback, q_ref_mm) if finding is None else None
         return finding
