@@ -274,8 +274,10 @@ class Procedure:
         """The last move reversed. It rests on what was executed, not on a fit."""
         p = self.progress
         executed = [(step.plan, step.path_time_s) for step in p.way]
-        q_now_mm, driven = self._where_axes_are(), self._settings.positioners.driven
-        p.plan = await self._survey.aside(lambda: retreat_plan(executed, q_now_mm, driven, p.moves + 1))
+        q_now_mm, settings = self._where_axes_are(), self._settings
+        p.plan = await self._survey.aside(
+            lambda: retreat_plan(executed, q_now_mm, settings.positioners, settings.plan, p.moves + 1)
+        )
         self.journal.write("plan", records.plan_record(p.plan))
         return Event.PLANNED
 
