@@ -69,7 +69,7 @@ class Relief:
         operator: Operator,
         clock: Callable[[], float],
     ) -> None:
-        self._run, self._clock = run, clock
+        self.run, self._clock = run, clock
         self.motion, self.journal, self.operator = motion, journal, operator
         self.progress = ReliefProgress()
         self.effects: dict[Effect, Callable[[], Awaitable[Event]]] = {
@@ -106,7 +106,7 @@ class Relief:
 
     async def _weigh(self) -> Event:
         """Judge the strain that is left, and what the last step did; then have the next step asked for."""
-        run, p = self._run, self.progress
+        run, p = self.run, self.progress
         weighing = await weigh(self.motion, run.settle)
         scales = Scales(run.positioners, run.plan, run.relief, weighing.position_mm)
         strain = scales.strain(weighing, run.tare)
@@ -130,11 +130,11 @@ class Relief:
         return Event.RELEASED
 
     def _keep(self, strain: Strain, weighing: Weighing) -> None:
-        names = self._run.positioners.names
+        names = self.run.positioners.names
         self.journal.write("strain", records.strain_record(names, strain, self.motion.axes, weighing))
         worst = names[int(np.argmax(strain.ball_n))]
         facts = {"ball": worst, "force_n": strain.largest_n, "sigma_n": strain.sigma_n}
-        if self._run.tare is not None:
+        if self.run.tare is not None:
             self.operator.notify("strain_since_tare", **facts)
         else:
             self.operator.notify("strain_absolute", **facts)
@@ -145,12 +145,12 @@ class Relief:
         if over.any():
             i = int(np.argmax(over))
             value, limit = float(strain.foreign_n[i]), float(strain.foreign_limit_n[i])
-            raise ForeignForce(f"ball {self._run.positioners.names[i]}", value=value, limit=limit)
+            raise ForeignForce(f"ball {self.run.positioners.names[i]}", value=value, limit=limit)
 
     def _check_rise(self, scales: Scales, before: Strain, now: Strain) -> None:
         """No ball may carry more than 5 % more than before the step; nor may the strain itself grow."""
         self._refuse_rise(now.force_n - before.force_n, scales.rise_limit_n(before))
-        slack = max(self._run.relief.rise * before.largest_n, float(scales.floor_n().max()))
+        slack = max(self.run.relief.rise * before.largest_n, float(scales.floor_n().max()))
         grown = now.largest_n - before.largest_n
         if not (grown <= slack):
             raise ForceRose("internal force", value=grown, limit=slack)
@@ -159,12 +159,12 @@ class Relief:
         over = ~(rise_n <= limit_n)
         if over.any():
             i = int(np.argmax(over))
-            name = self._run.positioners.names[i]
+            name = self.run.positioners.names[i]
             raise ForceRose(f"ball {name}", value=float(rise_n[i]), limit=float(limit_n[i]))
 
     def _relieved(self, strain: Strain) -> bool:
         """Whether the relief is at its end; raises NotRelieved when it goes no further and the target is not met."""
-        p, relief = self.progress, self._run.relief
+        p, relief = self.progress, self.run.relief
         p.stalled = 0 if strain.largest_n < p.lowest_n else p.stalled + 1
         p.lowest_n = min(p.lowest_n, strain.largest_n)
         if strain.largest_n <= relief.aim * relief.target_n:
@@ -177,7 +177,7 @@ class Relief:
         raise NotRelieved("part", cause, value=strain.largest_n, limit=relief.target_n)
 
     async def _declare(self) -> None:
-        names = self._run.permissives
+        names = self.run.permissives
         missing = await self.operator.permissives(names)
         body = {"stage": "relief", "declared": [n for n in names if n not in missing], "missing": list(missing)}
         self.journal.write("permissives", body)
@@ -185,7 +185,7 @@ class Relief:
             raise PermissiveMissing(missing[0], value="relief")
 
     def _next_plan(self, scales: Scales, strain: Strain, weighing: Weighing) -> Plan:
-        run, p = self._run, self.progress
+        run, p = self.run, self.progress
         if p.commanded_mm is None:
             raise PlanStale("relief", "the positioners are not enabled")
         q_now = np.where(run.positioners.driven, p.commanded_mm, weighing.position_mm)
@@ -195,7 +195,7 @@ class Relief:
         return plan
 
     def _passive(self) -> list[str]:
-        driven = self._run.positioners.driven
+        driven = self.run.positioners.driven
         return [axis for axis, on in zip(self.motion.axes, driven, strict=True) if not on]
 
     async def _step(self) -> Event:
@@ -213,7 +213,7 @@ class Relief:
 
     async def _guarded(self, plan: Plan, before: Strain) -> MoveResult:
         """Run the step; it is stopped on its way, and the rise raised, as soon as a ball's force rises too far."""
-        run = self._run
+        run = self.run
         limit_n = Scales(run.positioners, run.plan, run.relief, plan.q_mm[0]).rise_limit_n(before)
         guard = asyncio.ensure_future(self._guard(before, limit_n))
         try:
@@ -228,7 +228,7 @@ class Relief:
 
     async def _guard(self, before: Strain, limit_n: Array) -> None:
         latest: list[Array] = []
-        to_balls = np.transpose(self._run.positioners.axes_inverse, (0, 2, 1))
+        to_balls = np.transpose(self.run.positioners.axes_inverse, (0, 2, 1))
         while True:
             await asyncio.sleep(PAUSE_S)
             latest = [*latest[1 - GUARD_READINGS :], self.motion.feedback().force_n]
@@ -242,8 +242,9 @@ class Relief:
                 raise
 
 
-def summary_of(progress: ReliefProgress, run: ReliefRun) -> dict[str, Any]:
+def summary_of(relief: Relief) -> dict[str, Any]:
     """What a relief came to, for the journal and `--json`."""
+    progress, run = relief.progress, relief.run
     first, last = progress.first, progress.strain
     return {
         "supervisor": run.supervisor,

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from docking.assemble.motion_process import run_motion
     from docking.assemble.relieving import ReliefRequest, relieve
-from docking.assemble.runs import RunRequest, WireChoice, dry_run, run_on_wires, serve
+    from docking.assemble.runs import RunRequest, WireChoice, dry_run, run_on_wires, serve
 
-__all__ = ["ReliefRequest", "RunRequest", "WireChoice", "dry_run", "run_motion", "run_on_wires", "serve"]
+__all__ = ["ReliefRequest", "RunRequest", "WireChoice", "dry_run", "relieve", "run_motion", "run_on_wires", "serve"]
 
 
 def __getattr__(name: str) -> Any:
@@ -20,6 +20,10 @@ def __getattr__(name: str) -> Any:
         from docking.assemble import motion_process
 
         return motion_process.run_motion
+    if name in ("ReliefRequest", "relieve"):
+        from docking.assemble import relieving
+
+        return getattr(relieving, name)
     if name in __all__:
         from docking.assemble import runs
 

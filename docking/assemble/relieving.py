@@ -1,11 +1,9 @@
-"""A stress relief from files to summary: in virtual time, or on real wires with a supervisor at the terminal."""
+"""A stress relief from files to summary, on real wires, with a supervisor at the terminal."""
 
 from __future__ import annotations
 
 import asyncio
 import tempfile
-import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -14,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from docking.assemble.controller import Company, Wires
-from docking.assemble.motion_side import local_motion, motion_beside
+from docking.assemble.controller import Company
 from docking.assemble.real_time import on_interrupt, run_real
-from docking.assemble.runs import Files, RunRequest, Say, WireChoice, journal_path, load_files, near_ends, read_wires
-from docking.assemble.simulated import FarEnd, make_far_end, real_wires, truth_of
+from docking.assemble.runs import Files, RunRequest, Say, WireChoice, journal_path, load_files, read_wires
+from docking.assemble.simulated import make_far_end, real_wires, truth_of
+from docking.assemble.spawned import MotionProcess
 from docking.cell import Cell
 from docking.config.build import plan_period_s, plan_settings, positioners_from, relief_settings
 from docking.config.load import file_sha256
@@ -27,12 +25,11 @@ from docking.journal import JournalFile, read
 from docking.motion.settle import SettleSettings
 from docking.operators import TerminalOperator
 from docking.planning.relief import Tare, Weighing
-from docking.ports import Operator
+from docking.ports import Motion, Operator
 from docking.relief import Relief, ReliefRun, summary_of
 from docking.state import Event, State
 from docking.types import readonly
 from docking.version import VERSION
-from docking.words import tell
 
 OUTCOMES = {State.IDLE: "relieved", State.RECOVER: "stopped", State.FAULT: "fault"}
 
@@ -47,7 +44,9 @@ class ReliefRequest:
     after: Path | None
 
 
-def build_relief(files: Files, wires: Wires, company: Company, supervisor: str, tare: Tare | None) -> Cell[Relief]:
+def build_relief(
+    files: Files, motion: Motion, company: Company, supervisor: str, tare: Tare | None = None
+) -> Cell[Relief]:
     """The controller of one stress relief: the axes and no instrument."""
     cell, job = files.cell, files.job
     settle = cell.settle
@@ -61,7 +60,6 @@ def build_relief(files: Files, wires: Wires, company: Company, supervisor: str, 
         supervisor=supervisor,
         tare=tare,
     )
-    motion = motion_beside(cell, local_motion(cell, job, wires.can, wires.modbus))
     return Cell(Relief(run, motion, company.journal, company.operator, company.clock))
 
 
@@ -72,6 +70,7 @@ def relieve(request: ReliefRequest, choice: WireChoice, say: Say) -> dict[str, A
     with ExitStack() as stack:
         path = journal_path(request.run, stack)
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="docking-")))
+        process = stack.enter_context(MotionProcess())
 
         async def main() -> dict[str, Any]:
             far = None
@@ -80,42 +79,52 @@ def relieve(request: ReliefRequest, choice: WireChoice, say: Say) -> dict[str, A
                 found = await real_wires(files.cell, far, folder)
             else:
                 found = read_wires(choice.wires, files.cell) if choice.wires else {}
-            operator = TerminalOperator(say, request.run.language)
+            run = _Run(request, files, tare, TerminalOperator(say, request.run.language), path, choice.sim)
             try:
-                return await relieve_on_loop(files, near_ends(files.cell, found), operator, (request, tare, path), far)
+                return await _relieve(run, process, found)
             finally:
                 if far is not None:
                     await far.close()
 
-        return run_real(main, lambda: say(tell(request.run.language, "no_priority")))
+        return run_real(main, ticks=choice.sim and choice.wires is None)
 
 
-async def relieve_on_loop(
-    files: Files,
-    wires: Wires,
-    operator: Operator,
-    asked: tuple[ReliefRequest, Tare | None, Path],
-    far: FarEnd | None,
-    interrupt: Callable[[Callable[[], None]], None] = on_interrupt,
-) -> dict[str, Any]:
-    """Relieve once on the running loop and close the journal with the outcome; `asked`: request, tare, journal."""
-    request, tare, path = asked
-    loop = asyncio.get_running_loop()
-    started_s, wall_s = loop.time(), time.perf_counter()
-    journal = JournalFile(path, loop.time)
+@dataclass(frozen=True)
+class _Run:
+    request: ReliefRequest
+    files: Files
+    tare: Tare | None
+    operator: Operator
+    journal_path: Path
+    simulated: bool
+
+
+async def _relieve(run: _Run, process: MotionProcess, found: dict[str, Any]) -> dict[str, Any]:
+    """Relieve once on the running loop and close the journal with the outcome."""
+    loop, files, operator = asyncio.get_running_loop(), run.files, run.operator
+    started_s = loop.time()
+    journal = JournalFile(run.journal_path, loop.time)
+
+    def hear(kind: str, body: Any) -> None:
+        journal.write(
+            kind if kind == "lateness" else "motion_process", body if isinstance(body, dict) else {kind: body}
+        )
+        if kind == "hello" and not body["priority"]:
+            operator.notify("no_priority")
+
     try:
-        journal.write("run_started", _started(request, files, tare, simulated=far is not None), durable=True)
-        cell = build_relief(files, wires, Company(journal, operator, loop.time), request.supervisor, tare)
+        journal.write("run_started", _started(run), durable=True)
+        paths = (run.request.run.cell_path, files.job_path)
+        motion = await process.join(paths, files.cell, found, hear)
+        cell = build_relief(files, motion, Company(journal, operator, loop.time), run.request.supervisor, run.tare)
         operator.attend(cell.post, cell.override)
-        interrupt(lambda: _abort(cell, operator))
-        state = await cell.relieve()
-        summary = {
-            "outcome": OUTCOMES[state],
-            **summary_of(cell.procedure),
-            "true_internal_force_n": far.plant.true_internal_force_n() if far is not None else None,
-            "virtual_time_s": loop.time() - started_s,
-            "wall_time_s": time.perf_counter() - wall_s,
-        }
+        on_interrupt(lambda: _abort(cell, operator))
+        try:
+            state = await cell.relieve()
+        finally:
+            journal.write("motion_process", await process.end())
+        elapsed_s = loop.time() - started_s
+        summary = {"outcome": OUTCOMES[state], **summary_of(cell.procedure), "elapsed_s": elapsed_s}
         journal.write("outcome", summary, durable=True)
         return summary
     finally:
@@ -127,7 +136,8 @@ def _abort(cell: Cell[Relief], operator: Operator) -> None:
     cell.post(Event.ABORT)
 
 
-def _started(request: ReliefRequest, files: Files, tare: Tare | None, *, simulated: bool) -> dict[str, Any]:
+def _started(run: _Run) -> dict[str, Any]:
+    request, files = run.request, run.files
     return {
         "command": "relieve",
         "supervisor": request.supervisor,
@@ -137,12 +147,12 @@ def _started(request: ReliefRequest, files: Files, tare: Tare | None, *, simulat
         "job_sha256": file_sha256(files.job_path),
         "part_number": files.job.part_number,
         "serial_number": files.job.serial_number,
-        "seed": request.run.seed if simulated else None,
-        "simulated": simulated,
+        "seed": request.run.seed if run.simulated else None,
+        "simulated": run.simulated,
         "version": VERSION,
         "axes": list(files.cell.axis_names),
         "after": None if request.after is None else str(request.after),
-        "tare_age_h": None if tare is None else tare.age_h,
+        "tare_age_h": None if run.tare is None else run.tare.age_h,
     }
 
 

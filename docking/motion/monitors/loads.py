@@ -137,16 +137,21 @@ class BallLoads:
             found.append(Finding(Trigger.OVERLOAD, error))
         if not self._ready:
             return found
-        share = self._share(force_n, q_ref_mm)
+        share = self._share(force_n, q_ref_mm, moving)
         return [*found, *([] if share is None else [share]), *self._internal(force_n, q_ref_mm, moving)]
 
-    def _share(self, force_n: Array, q_ref_mm: Array) -> Finding | None:
-        """The load of each ball against what it should carry."""
+    def _share(self, force_n: Array, q_ref_mm: Array, moving: bool) -> Finding | None:
+        """The load of each ball against what it should carry.
+
+        A part that a stop left strained may stand with more on a ball than its weight puts there: a relief must be able
+        to begin from there, any other move is not.
+        """
         expected = (self._upward @ (self._expected_n + self._per_mm @ (q_ref_mm - self._q_mm)))[self._whole]
         carried = (self._upward @ np.where(self._blind, 0.0, force_n))[self._whole]
         limits, names = self._limits, np.array(self._positioners.names)[self._whole]
         most = expected * limits.overload
-        if not self._margins.note("overload", float(np.max((carried - expected) / (most - expected)))):
+        judged = moving and not self._relief
+        if judged and not self._margins.note("overload", float(np.max((carried - expected) / (most - expected)))):
             k = int(np.argmin(carried <= most))
             cause = f"{expected[k]:.0f} N are expected."
             error = BallForceTrip(str(names[k]), cause, value=float(carried[k]), limit=float(most[k]))

@@ -191,6 +191,8 @@ def test_each_ball_carries_about_its_share(share, trigger, ball, moving):
     expected = force[3 * ball + 2]
     force[3 * ball + 2] = share * expected
     found = bench.twice(force, moving=moving)
+    if trigger is Trigger.OVERLOAD and not moving:
+        trigger = None  # a strained part may stand so: a relief begins from there
     assert (None if found is None else found.trigger) is trigger
     if found is not None:
         assert isinstance(found.error, BallForceTrip if trigger is Trigger.OVERLOAD else BallUnloaded)
