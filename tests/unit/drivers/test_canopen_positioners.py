@@ -439,6 +439,20 @@ def test_a_force_that_is_not_repeated_for_three_periods_is_forgotten() -> None:
     run(scenario)
 
 
+def test_a_load_cell_that_shows_its_most_negative_count_shows_nothing() -> None:
+    async def scenario(bench: Bench) -> None:
+        q = await bench.ready()
+        broken = 1000.0 + 10.0 * np.arange(12)
+        broken[[3, 5]] = -327680.0, -327670.0
+        bench.plant.force_n = lambda: broken  # type: ignore[method-assign]
+        feedback = await tick(bench, lambda k: q, 13)
+        assert np.isnan(feedback[-1].force_n[3])
+        assert feedback[-1].force_n[5] == -327670.0
+        assert not np.isnan(np.delete(feedback[-1].force_n, 3)).any()
+
+    run(scenario)
+
+
 def test_a_load_cell_that_never_reports_is_named_before_anything_is_enabled() -> None:
     async def scenario(bench: Bench) -> None:
         bench.bus.keep = lambda cob, data: cob != 0x284
