@@ -93,7 +93,9 @@ class ModbusPositioners:
         self.path_spread_s = float("nan")
         self.on_lost: Callable[[], None] = lambda: None
         self._stuck_mm = cell.limits.stuck_mm
-        self._quick_ramp_s, self._rate = self._bus.ramp_s, 1.0
+        self.ramp_s = self.quick_ramp_s = self._bus.ramp_s
+        self._rate = 1.0
+        self._told_quick_stop = False
         um = 1.0 / self._map.scale["position_per_mm"]
         self._units = np.array([[um], [um], [self._map.scale["force_n"]]])
         self._shown: list[AxisState] = []
@@ -126,10 +128,11 @@ class ModbusPositioners:
         async with self._alone:
             await self._all(plc.refresh() for plc in self._plcs)
             ill = [plc for plc in self._plcs if plc.state == "fault"]
-            for plc in sorted(ill, key=lambda plc: plc.blames_another):
+            for plc in sorted(ill, key=lambda plc: plc.comes_after):
                 raise EnableFailed(plc.where, plc.fault_words(), value="fault")
             await self._all(plc.command("enable") for plc in self._plcs)
             await self._all(plc.reach(ENABLE_S, "enabled", "held", "done") for plc in self._plcs)
+            self._told_quick_stop = False
             return self._feedback()
 
     async def load(self, plan: Plan) -> None:
@@ -145,7 +148,7 @@ class ModbusPositioners:
             await self._all(plc.command("stop") for plc in self._plcs)
             await self._all(plc.reach(self._bus.ramp_s + ENABLE_S, "enabled") for plc in self._plcs)
             self._check_start(plan)
-            self._quick_ramp_s = self._quick_ramp_of(plan)
+            self.quick_ramp_s = self._quick_ramp_of(plan)
             await self._set_motion()
             per_mm = self._map.scale["position_per_mm"]
             raw = np.rint(plan.q_mm * per_mm).astype(np.int64)
@@ -169,7 +172,7 @@ class ModbusPositioners:
         return quick_s
 
     async def _set_motion(self) -> None:
-        await self._all(plc.set_motion(self._quick_ramp_s, self._rate) for plc in self._plcs)
+        await self._all(plc.set_motion(self.quick_ramp_s, self._rate) for plc in self._plcs)
 
     async def override(self, rate: float) -> None:
         """Playback rate (over 0, to 1) from the next run or resume on; path time must stand still."""
@@ -210,6 +213,7 @@ class ModbusPositioners:
         if verb not in VERBS:
             raise BadArgument("verb", f"one of {', '.join(VERBS)}", value=verb)
         async with self._alone:
+            self._told_quick_stop = verb == "quick-stop" or self._told_quick_stop
             if verb in ("stop", "quick-stop"):
                 for plc in self._plcs:
                     plc.abandon()
@@ -225,22 +229,29 @@ class ModbusPositioners:
         """A reset is for those in fault; a resume for those that a hold caught before the end of their queue."""
         return plc.state == "fault" if verb == "reset" else not (verb == "resume" and plc.state == "done")
 
-    async def poll(self) -> Feedback:
+    async def poll(self, *, surviving: bool = False) -> Feedback:
         """One cycle: heartbeat and next segment out, status in, from all PLCs at once.
 
         Raises DeviceSilent after two lost replies in a row, LinkLost on a broken connection or a heartbeat that
-        stands still, SegmentRejected when a PLC rejects a segment.
+        stands still, SegmentRejected when a PLC rejects a segment. With `surviving` a PLC that fails is only shown as
+        old, by its `age_cycles`.
         """
         async with self._alone:
-            await self._all(self._cycle(plc, watch) for plc, watch in zip(self._plcs, self._watches, strict=True))
-            if any(plc.fault for plc in self._plcs) and self._ill() is None:
+            cycles = [self._cycle(plc, watch) for plc, watch in zip(self._plcs, self._watches, strict=True)]
+            if surviving:
+                results = await asyncio.gather(*cycles, return_exceptions=True)
+                for watch, result in zip(self._watches, results, strict=True):
+                    watch.misses += isinstance(result, DockingError) and not isinstance(result, DeviceSilent)
+            else:
+                await self._all(cycles)
+            if any(plc.fault for plc in self._plcs) and self._ill() is None and not self._told_quick_stop:
                 # Those that were read first show only that the line fell; the one that dropped it has its fault by now.
                 await asyncio.gather(*(plc.refresh() for plc in self._plcs), return_exceptions=True)
             return self._feedback()
 
     def _ill(self) -> PositionerPlc | None:
         """The first PLC with a fault of its own."""
-        return next((plc for plc in self._plcs if plc.fault and not plc.blames_another), None)
+        return next((plc for plc in self._plcs if plc.fault and not plc.comes_after), None)
 
     async def _cycle(self, plc: PositionerPlc, watch: _Watch) -> None:
         try:
@@ -272,6 +283,18 @@ class ModbusPositioners:
         """True when the queue is shorter than `depth` and the PLC takes segments."""
         return plc.waiting > 0 and plc.depth < depth and plc.state in _MOVING and not plc.fault
 
+    @property
+    def braked(self) -> bool:
+        """True when every driven axis reports its brake closed, as last read."""
+        bit = self._map.flags["axis_braked"]
+        bits = np.array([axis[3] for plc in self._plcs for axis in plc.status.axes])
+        return bool(((bits & bit) != 0)[self._driven].all())
+
+    def go_silent(self) -> None:
+        """Drop all connections: every PLC misses its heartbeat, ramps down and brakes."""
+        for plc in self._plcs:
+            plc.unit.close()
+
     async def close(self) -> None:
         """Disable all axes (ramp, brakes, power) and disconnect.
 
@@ -298,8 +321,10 @@ class ModbusPositioners:
         words = np.array([axis for plc in self._plcs for axis in plc.status.axes], dtype=np.float64).T
         raw = words[:3] * self._units
         raw[2, words[2] == self._map.scale["no_force"]] = np.nan
-        times = [plc.path_time_s() for plc in self._plcs]
+        heard = [plc for plc, watch in zip(self._plcs, self._watches, strict=True) if not watch.misses]
+        times = [plc.path_time_s() for plc in heard or self._plcs]
         self.path_spread_s = max(times) - min(times)
+        at_limit = (words[3].astype(np.int64) & self._map.flags["axis_limit"]) != 0
         return Feedback(
             t_s=asyncio.get_running_loop().time(),
             position_mm=raw[0],
@@ -309,7 +334,7 @@ class ModbusPositioners:
             age_cycles=np.repeat([float(watch.misses) for watch in self._watches], 3),
             path_time_s=min(times),
             fault=self._fault(),
-            at_limit=(words[3].astype(np.int64) & self._map.flags["axis_limit"]) != 0,
+            at_limit=at_limit if at_limit.any() else None,
         )
 
     def _states(self) -> tuple[AxisState, ...]:
@@ -325,9 +350,9 @@ class ModbusPositioners:
         return self._axis_states
 
     def _fault(self) -> tuple[str, int, str] | None:
-        """The fault that came first; one that another positioner caused only when nobody has the cause."""
+        """The fault that came first; one that something else caused only when nobody has the cause, nor the host."""
         plc = self._ill() or next((plc for plc in self._plcs if plc.fault), None)
-        if plc is None:
+        if plc is None or (plc.comes_after and self._told_quick_stop):
             return None
         bit = self._map.flags["axis_fault"]
         axes = plc.config.axes

@@ -29,6 +29,9 @@ from drivers.modbus_client import ModbusUnit
 from drivers.register_map import RegisterMap
 
 ACKNOWLEDGE_S = 0.15
+ACKNOWLEDGE_SCANS = 3
+"""A command that has arrived is acknowledged after the next scan: after so many it has not. The heartbeats of the other
+PLCs wait meanwhile."""
 ENABLE_S = 3.0
 LOOK_AGAIN_S = 0.005
 REPEATABLE = frozenset(("hold", "stop", "quick-stop", "disable"))
@@ -184,8 +187,8 @@ class PositionerPlc:
         return self.status.head.get("fault", 0)
 
     @property
-    def blames_another(self) -> bool:
-        """True when it is in fault only because another positioner is."""
+    def comes_after(self) -> bool:
+        """True when it is in fault only because another positioner is, or the host told it to."""
         return self.fault in self._map.consequences
 
     def fault_words(self) -> str:
@@ -217,9 +220,15 @@ class PositionerPlc:
             await self._seen()
         loop = asyncio.get_running_loop()
         end_s = loop.time() + ACKNOWLEDGE_S
+        first_scan: int | None = None
         while True:
-            if await self._seen() and self.status.head["cmd_ack"] == sequence:
-                return True
+            if await self._seen():
+                head = self.status.head
+                if head["cmd_ack"] == sequence:
+                    return True
+                first_scan = head["hb_plc"] if first_scan is None else first_scan
+                if (head["hb_plc"] - first_scan) & 0xFFFF >= ACKNOWLEDGE_SCANS:
+                    return False
             if not loop.time() < end_s:
                 return False
             await asyncio.sleep(LOOK_AGAIN_S)

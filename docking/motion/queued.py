@@ -1,238 +1,423 @@
-"""Motion over positioners that play a queue of segments after one common start."""
+"""Motion over positioners that play a queue of segments after one common start.
+
+One task polls, judges and commands, from `enable` to `close`. The controllers ramp by themselves: a stop on the path is
+their ordinary ramp, everything harder their quick one, which ends with brakes and no torque.
+"""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
-from collections import deque
+from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 
-from docking.errors import Defect, DockingError, PlanStale
+from docking.errors import (
+    BadArgument,
+    BadReply,
+    Defect,
+    DeviceSilent,
+    DockingError,
+    EventRefused,
+    LinkLost,
+    OutcomeUnknown,
+    PlanStale,
+    StoppedByOperator,
+)
+from docking.motion.arbiter import Arbiter, Mode, Reaction, Role
 from docking.motion.monitors import Watch
 from docking.motion.playback import Playback
 from docking.motion.recorder import Recorder
+from docking.motion.triggers import Finding, Trigger
 from docking.ports import QueuedPositioners
-from docking.types import Array, AxisState, Feedback, Identity, MoveResult, Plan
+from docking.types import Array, AxisState, Feedback, Identity, MoveResult, Plan, readonly
 
 START_TOLERANCE_MM = 0.02
 STANDSTILL_MM = 0.002
 END_POLLS = 3
 END_S = 1e-6
 TRACE_PERIOD_S = 0.1
+BRAKE_S = 2.0
+TOLD_S = 0.5
+"""In so long a stop has reached every controller that can be reached, and its end has been seen."""
+RESET_S = 0.3
+"""How long nothing may be found again after the controllers were told to forget their faults."""
+
+
+class _Phase(Enum):
+    """What the controllers were last told about a move."""
+
+    LOADED = 1
+    RUNNING = 2
+    HOLDING = 3
+
+
+@dataclass(eq=False)
+class _Move:
+    """A running move; `held`: the operator holds it."""
+
+    playback: Playback
+    recorder: Recorder
+    done: asyncio.Future[MoveResult]
+    held: bool = False
+    phase: _Phase = _Phase.LOADED
+
+    def ended(self, feedback: Feedback) -> bool:
+        return feedback.path_time_s >= self.playback.plan.duration_s - END_S
 
 
 class QueuedMotion:
-    """The `Motion` port over `QueuedPositioners`: polls, watches, and asks all controllers to ramp on any trip."""
+    """The `Motion` port over `QueuedPositioners`. `arbiter` decides every stop that the controllers do not."""
 
     def __init__(self, positioners: QueuedPositioners, watch: Watch, poll_s: float) -> None:
         self._bus, self._watch, self._poll_s = positioners, watch, poll_s
         self.axes = positioners.axes
+        self.arbiter = Arbiter(self._allowed_s)
         self._commanded: Array = np.zeros(len(self.axes))
         self._feedback: Feedback | None = None
-        self._playback: Playback | None = None
-        self._verbs: deque[str] = deque()
-        self._idle: asyncio.Task[None] | None = None
-        self._cause: DockingError | None = None
-        self._moving = self._slowing = False
+        self._loaded: Playback | None = None
+        self._move: _Move | None = None
+        self._early: list[str] = []
+        self._share = self._told_share = 1.0
+        self._applied = Reaction.NONE
+        self._deaf = self._slowing = False
         self._still = self._unasked = 0
+        self._keeper: asyncio.Task[None] | None = None
+        self._sleeper: asyncio.Future[None] | None = None
+        self._cycled = asyncio.Event()
+        self._cycles, self._keeping, self._polled_s = 0, False, 0.0
+        positioners.on_lost = self._wake
 
+    # the port ----------------------------------------------------------------------------------------------------
     async def connect(self) -> tuple[Identity, ...]:
         return await self._bus.bring_up()
 
     async def enable(self) -> Array:
-        if self._moving:
-            raise PlanStale("motion", "a move is running")
-        await self._end_idle()
+        """Raises the fault that is kept: `reset` comes first."""
+        self._refuse()
+        await self._end_keeper()
+        self.arbiter.enter(Mode.OFF)
         self._feedback = await self._bus.enable()
-        self._commanded = np.array(self._feedback.position_mm)
-        self._commanded.setflags(write=False)
-        self._cause = self._playback = None
-        self._verbs.clear()
+        self._commanded = readonly(self._feedback.position_mm)
+        self._loaded, self._deaf = None, False
+        self._early.clear()
         self._watch.watch_about(self._commanded)
-        self._idle = asyncio.get_running_loop().create_task(self._keep_alive())
+        self.arbiter.enter(Mode.STANDING)
+        self._keeping, self._polled_s = True, asyncio.get_running_loop().time()
+        self._keeper = asyncio.get_running_loop().create_task(self._keep())
         return self._commanded
 
     async def load(self, plan: Plan) -> None:
-        if self._cause is not None:
-            raise self._cause
-        if self._moving:
-            raise PlanStale(plan.stage, "a move is running")
+        """Take a plan; the controllers take its start and its quick ramp. Nothing moves."""
+        self._refuse()
         gap = float(np.max(np.abs(plan.q_mm[0] - self._commanded)[self._watch.driven]))
         if not (gap <= START_TOLERANCE_MM):
             raise PlanStale(plan.stage, f"it starts {gap:.4f} mm from where the axes are commanded")
-        self._watch.watch_about(plan.q_mm[0])
+        self._loaded = None
+        self._require_enabled()
         await self._bus.load(plan)
-        self._playback = Playback(plan)
-        self._require_enabled(await self._read(self._playback))
-
-    def _require_enabled(self, feedback: Feedback) -> None:
-        off = self._watch.power(feedback)
-        if off is not None:
-            raise off
+        await self._next_cycle()
+        self._refuse()
+        self._require_enabled()
+        self._watch.watch_about(plan.q_mm[0])
+        self._commanded = plan.q_mm[0]
+        self._loaded = Playback(plan)
 
     async def start(self, plan_hash: str) -> MoveResult:
-        if self._cause is not None:
-            raise self._cause
-        if self._moving:
-            raise PlanStale("motion", "a move is running")
-        playback, self._playback = self._playback, None
+        self._refuse()
+        playback, self._loaded = self._loaded, None
         if playback is None or playback.plan.plan_hash != plan_hash:
             raise PlanStale("motion", "this plan is not loaded")
-        self._require_enabled(self.feedback())
+        self._require_enabled()
         recorder = Recorder(self._watch, max(1, round(TRACE_PERIOD_S / self._poll_s)))
-        self._moving, self._slowing = True, False
+        self.arbiter.enter(Mode.MOVING)
+        self._move = move = _Move(playback, recorder, asyncio.get_running_loop().create_future())
+        self._slowing, self._still, self._unasked = False, 0, 0
+        early, self._early = self._early, []
+        for verb in early:
+            self._obey(move, verb)
+        self._wake()
         try:
-            outcome = await self._play(playback, recorder)
-        except DockingError as error:
-            self._cause = self._cause or error
-            outcome = "fault"
-            await self._stop_all()
-        except BaseException as error:
-            # A defect, or nobody waits for this move any more: so nobody watches it.
-            if isinstance(error, Exception):
-                self._cause = self._cause or _defect(error)
-            await self._stop_all()
+            return await asyncio.shield(move.done)
+        except asyncio.CancelledError:
+            # Nobody waits for this move any more, so nobody watches it.
+            self.request("stop")
             raise
-        finally:
-            self._moving = False
-            self._verbs.clear()
-        return self._result(outcome, playback, recorder)
-
-    async def _play(self, playback: Playback, recorder: Recorder) -> str:
-        if not await self._set_off():
-            return "stopped"
-        stop_asked, self._still = False, 0
-        before = await self._read(playback)
-        while True:
-            await asyncio.sleep(self._poll_s)
-            feedback = await self._read(playback)
-            recorder.add(feedback, feedback.path_time_s)
-            self._count_still(before, feedback)
-            before = feedback
-            ended = feedback.path_time_s >= playback.plan.duration_s - END_S
-            stop_asked = await self._obey(feedback, stop_asked, ended)
-            if self._still < END_POLLS:
-                continue
-            if self._cause is not None:
-                return "fault"
-            if ended or stop_asked:
-                return "done" if ended else "stopped"
-
-    async def _set_off(self) -> bool:
-        """Give the common start, after a hold that came before it is over; False when a stop came before it."""
-        held = False
-        while self._verbs or held:
-            while self._verbs:
-                verb = self._verbs.popleft()
-                if verb == "stop":
-                    return False
-                held = verb == "hold"
-            if held:
-                await asyncio.sleep(self._poll_s)
-                await self._read(None)
-                if self._cause is not None:
-                    raise self._cause
-        await self._command("run")
-        return True
-
-    def _count_still(self, before: Feedback, now: Feedback) -> None:
-        moved = np.abs(now.position_mm - before.position_mm)
-        resting = AxisState.STOPPING not in now.states and np.max(moved) <= STANDSTILL_MM
-        self._still = self._still + 1 if resting else 0
-
-    async def _read(self, playback: Playback | None) -> Feedback:
-        feedback = await self._bus.poll()
-        self._feedback = feedback
-        may_stop = self._may_stop(feedback)
-        if playback is None:
-            finding = self._watch.evaluate(feedback, self._commanded, 0.0, moving=False, may_stop=may_stop)
-        else:
-            at = feedback.path_time_s
-            chord, speed = playback.chord_at(at), playback.speed_at(at)
-            finding = self._watch.evaluate(feedback, chord, speed, moving=self._moving, may_stop=may_stop)
-        if finding is not None and self._cause is None:
-            self._cause = finding.error
-            if self._moving:
-                await self._command("stop")
-        return feedback
-
-    def _may_stop(self, feedback: Feedback) -> bool:
-        """Whether an axis may be ramping down now: after a hold or a stop, and for one poll without.
-
-        A controller that faults takes the others along over the common line; the next poll tells which it was.
-        """
-        unasked = AxisState.STOPPING in feedback.states and not self._slowing
-        self._unasked = self._unasked + 1 if unasked else 0
-        return self._moving and self._unasked <= 1
-
-    async def _obey(self, feedback: Feedback, stop_asked: bool, ended: bool) -> bool:
-        """Pass on one verb, so that the next is judged by a read-back that shows its effect."""
-        if not self._verbs:
-            return stop_asked
-        if self._verbs[0] == "resume":
-            if AxisState.STOPPING in feedback.states:
-                return stop_asked
-            self._verbs.popleft()
-            if not (stop_asked or ended or self._cause is not None):
-                await self._command("resume")
-            return stop_asked
-        verb = self._verbs.popleft()
-        await self._command(verb)
-        return stop_asked or verb == "stop"
-
-    async def _command(self, verb: str) -> None:
-        self._still = 0
-        self._slowing = verb in ("hold", "stop")
-        await self._bus.command(verb)
-
-    async def _stop_all(self) -> None:
-        """Have those controllers that still listen ramp down; the others follow the common line or their watchdogs."""
-        with contextlib.suppress(DockingError):
-            await self._command("stop")
-
-    def _result(self, outcome: str, playback: Playback, recorder: Recorder) -> MoveResult:
-        path_time = self._feedback.path_time_s if self._feedback is not None else float("nan")
-        self._commanded = playback.chord_at(path_time) if path_time >= 0.0 else self._commanded
-        return recorder.result(outcome, path_time, self._commanded, self._cause)
-
-    async def _keep_alive(self) -> None:
-        while True:
-            await asyncio.sleep(self._poll_s)
-            if self._moving:
-                continue
-            try:
-                await self._read(None)
-            except DockingError as error:
-                self._cause = self._cause or error
-                return
-            except Exception as error:
-                self._cause = self._cause or _defect(error)
-                await self._stop_all()
-                raise
 
     def request(self, verb: str) -> None:
-        if verb != "resume":
-            # A hold or a stop overtakes a resume that still waits for the end of a ramp.
-            self._verbs.clear()
-        self._verbs.append(verb)
+        """`hold`, `resume` or `stop`, all on the path. Never waits."""
+        if self._move is None:
+            self._early.append(verb)
+            return
+        self._obey(self._move, verb)
+        self._wake()
+
+    def _obey(self, move: _Move, verb: str) -> None:
+        if verb == "stop":
+            self._raise(Trigger.OPERATOR_STOP, StoppedByOperator("motion"))
+        else:
+            move.held = verb == "hold"
+
+    def override(self, percent: float) -> None:
+        """Run this move and later ones at `percent` (0..100) of their speed, on the same path. A hold goes on.
+
+        The controllers take a new rate at standstill only: a move in progress is held for it. Raises BadArgument.
+        """
+        if not (0.0 <= percent <= 100.0):
+            raise BadArgument("speed override", value=percent, limit="0 to 100 %")
+        self._share = percent / 100.0
+        self._wake()
+
+    def report(self, finding: Finding) -> None:
+        """Something outside the axes asks for a reaction: judged and latched as what the monitors find."""
+        self._raise(finding.trigger, finding.error)
+        self._wake()
+
+    async def reset(self, role: str) -> None:
+        """Forget the fault that is kept, on a person's order; then the axes have to be enabled again. Moves nothing.
+
+        Controllers in fault are reset, too. Raises EventRefused with the reason, and what their commands raise.
+        """
+        asked = Role(role)
+        objection = self.arbiter.objection(asked)
+        if objection:
+            raise EventRefused("reset", objection, value=f"reset by {role}")
+        await self._bus.command("reset")
+        self._deaf = False
+        await asyncio.sleep(RESET_S)
+        self.arbiter.reset(asked, asyncio.get_running_loop().time())
+        self._applied = Reaction.NONE
+        self.arbiter.enter(Mode.OFF)
 
     def feedback(self) -> Feedback:
-        if self._cause is not None:
-            raise self._cause
+        """The newest read-back. Raises the fault that is kept."""
+        if self.arbiter.first is not None:
+            raise self.arbiter.first.error
         if self._feedback is None:
             raise PlanStale("motion", "the positioners are not enabled")
         return self._feedback
 
     async def close(self) -> None:
-        await self._end_idle()
+        if self._move is not None:
+            self.request("stop")
+            await asyncio.wait((self._move.done,))
+        await self._end_keeper()
         await self._bus.close()
 
-    async def _end_idle(self) -> None:
-        if self._idle is not None:
-            self._idle.cancel()
-            await asyncio.gather(self._idle, return_exceptions=True)
-            self._idle = None
+    def _refuse(self) -> None:
+        """Raise what forbids that anything begins."""
+        if self.arbiter.first is not None:
+            raise self.arbiter.first.error
+        if self._move is not None:
+            raise PlanStale("motion", "a move is running")
+
+    def _require_enabled(self) -> None:
+        off = self._watch.power(self.feedback())
+        if off is not None:
+            raise off
+        if self.arbiter.mode is not Mode.STANDING:
+            raise PlanStale("motion", "the axes have to be enabled again")
+
+    # the keeper --------------------------------------------------------------------------------------------------
+    async def _keep(self) -> None:
+        try:
+            while self._applied is not Reaction.HW:
+                await self._nap()
+                await self._cycle()
+                self._cycles += 1
+                self._cycled.set()
+        except Exception as error:
+            # Nobody polls any more: the controllers are told once, and miss the heartbeat afterwards. Whoever waits
+            # for the move learns why, and so does everyone who asks later.
+            self._raise(Trigger.DEFECT, _defect(error))
+            await self._react()
+            move, self._move = self._move, None
+            if move is not None and not move.done.done():
+                move.done.set_exception(error)
+            raise
+        finally:
+            self._keeping = False
+            self._cycled.set()
+
+    async def _next_cycle(self) -> None:
+        """Wait for a read-back that is asked for after this call."""
+        self._wake()
+        # One cycle may be under way already.
+        due = self._cycles + 2
+        while self._keeping and self._cycles < due:
+            self._cycled.clear()
+            await self._cycled.wait()
+
+    async def _nap(self) -> None:
+        """Sleep until the next poll is due, or something is to be done.
+
+        A poll that took long brings the next one forward: the controllers count the time between two heartbeats.
+        """
+        loop = asyncio.get_running_loop()
+        self._sleeper = loop.create_future()
+        timer = loop.call_at(self._polled_s + self._poll_s, self._wake)
+        try:
+            await self._sleeper
+        finally:
+            timer.cancel()
+        self._polled_s = loop.time()
+
+    def _wake(self) -> None:
+        if self._sleeper is not None and not self._sleeper.done():
+            self._sleeper.set_result(None)
+
+    async def _end_keeper(self) -> None:
+        if self._keeper is not None:
+            self._keeper.cancel()
+            await asyncio.gather(self._keeper, return_exceptions=True)
+            self._keeper = None
+
+    async def _cycle(self) -> None:
+        before = self._feedback
+        feedback = await self._poll()
+        if feedback is not None:
+            self._count_still(before, feedback)
+            self._judge(feedback)
+            if self._move is not None:
+                self._move.recorder.add(feedback, feedback.path_time_s)
+        await self._react()
+        now_s = asyncio.get_running_loop().time()
+        self.arbiter.poll(now_s, self.arbiter.mode is Mode.STOPPING and self._at_rest())
+        await self._react()
+        move = self._move
+        if self.arbiter.mode in (Mode.STANDING, Mode.OFF):
+            self._end_stop()
+        elif move is not None and feedback is not None and self.arbiter.mode is Mode.MOVING:
+            if move.ended(feedback) and self._still >= END_POLLS:
+                self._finish("done")
+            else:
+                await self._lead(move, feedback)
+
+    async def _poll(self) -> Feedback | None:
+        """A read-back; None when it fails, and from then on read-backs of those that still answer."""
+        try:
+            self._feedback = await self._bus.poll(surviving=self._deaf)
+        except DockingError as error:
+            self._deaf = True
+            self._raise(_trigger_of(error), error)
+            return None
+        return self._feedback
+
+    def _count_still(self, before: Feedback | None, now: Feedback) -> None:
+        """Count read-backs in a row, each a poll after the one before, in which those that answer stand."""
+        fresh = now.age_cycles == 0.0
+        if before is None or not fresh.any():
+            self._still = 0
+        elif now.t_s - before.t_s >= 0.5 * self._poll_s:
+            moved = np.max(np.abs(now.position_mm - before.position_mm)[fresh])
+            resting = AxisState.STOPPING not in now.states and moved <= STANDSTILL_MM
+            self._still = self._still + 1 if resting else 0
+
+    def _at_rest(self) -> bool:
+        return self._still >= END_POLLS and (self._applied is not Reaction.SBT or self._bus.braked)
+
+    async def _lead(self, move: _Move, feedback: Feedback) -> None:
+        """One command towards what operator and override ask for; the next read-back shows its effect."""
+        wanted = not move.held and self._share > 0.0
+        if move.phase is _Phase.RUNNING:
+            if not wanted or self._share != self._told_share:
+                move.phase = _Phase.HOLDING
+                await self._tell("hold")
+        elif wanted and AxisState.STOPPING not in feedback.states and not move.ended(feedback):
+            verb = "run" if move.phase is _Phase.LOADED else "resume"
+            move.phase = _Phase.RUNNING
+            await self._tell(verb)
+            move.playback.rate = self._told_share
+
+    async def _tell(self, verb: str) -> None:
+        self._still = 0
+        self._slowing = verb in ("hold", "stop", "quick-stop")
+        try:
+            if not self._slowing and self._share != self._told_share:
+                share = self._share
+                await self._bus.override(share)
+                self._told_share = share
+            await self._bus.command(verb)
+        except DockingError as error:
+            self._deaf = True
+            self._raise(_trigger_of(error), error)
+
+    # monitors and reactions --------------------------------------------------------------------------------------
+    def _judge(self, feedback: Feedback) -> None:
+        """Put the monitors' finding to the arbiter. In a quick stop the controllers switch off by themselves."""
+        may_stop = self._may_stop(feedback)
+        if self._deaf or self.arbiter.mode is Mode.OFF or self._applied >= Reaction.FAST_PPS:
+            return
+        move = self._move
+        if move is None:
+            finding = self._watch.evaluate(feedback, self._commanded, 0.0, moving=False, may_stop=may_stop)
+        else:
+            at_s = feedback.path_time_s
+            chord, speed = move.playback.chord_at(at_s), move.playback.speed_at(at_s)
+            finding = self._watch.evaluate(feedback, chord, speed, moving=True, may_stop=may_stop)
+        if finding is not None:
+            self._raise(finding.trigger, finding.error)
+
+    def _may_stop(self, feedback: Feedback) -> bool:
+        """Whether an axis may be ramping down now: after a hold or a stop, and for one poll without.
+
+        A controller that faults takes the others along over the common lines; the next poll tells which it was.
+        """
+        unasked = AxisState.STOPPING in feedback.states and not self._slowing
+        self._unasked = self._unasked + 1 if unasked else 0
+        return self._move is not None and self._unasked <= 1
+
+    def _raise(self, trigger: Trigger, error: DockingError) -> None:
+        self.arbiter.raise_(Finding(trigger, error), asyncio.get_running_loop().time())
+
+    def _allowed_s(self, reaction: Reaction) -> float:
+        """How long a reaction that begins now may take."""
+        ramp_s = self._bus.ramp_s if reaction is Reaction.PPS else self._bus.quick_ramp_s
+        return BRAKE_S if reaction is Reaction.SBT else ramp_s + TOLD_S + (END_POLLS + 1) * self._poll_s
+
+    async def _react(self) -> None:
+        """Begin the reaction in force, unless it has begun. A failed command may raise it once more."""
+        while self.arbiter.reaction > self._applied:
+            begun, self._applied = self._applied, self.arbiter.reaction
+            if self._applied is Reaction.HW:
+                self._bus.go_silent()
+                self._finish("fault")
+            elif self._applied >= Reaction.FAST_PPS > begun:
+                await self._tell("quick-stop")
+            elif self._applied is Reaction.PPS:
+                await self._tell("stop")
+
+    def _end_stop(self) -> None:
+        """The axes have come to rest after a stop: end the move, if there is one."""
+        move, feedback = self._move, self._feedback
+        if self._applied >= Reaction.FAST_PPS:
+            # The controllers have braked and taken the torque.
+            self.arbiter.enter(Mode.OFF)
+        if move is not None and feedback is not None:
+            self._finish("fault" if self.arbiter.latched else "done" if move.ended(feedback) else "stopped")
+        if not self.arbiter.latched:
+            self._applied = self.arbiter.reaction
+
+    def _finish(self, outcome: str) -> None:
+        move, self._move = self._move, None
+        if move is None:
+            return
+        path_time_s = self._feedback.path_time_s if self._feedback is not None else float("nan")
+        if path_time_s >= 0.0:
+            self._commanded = readonly(move.playback.chord_at(path_time_s))
+        cause = self.arbiter.first.error if self.arbiter.first is not None else None
+        if self.arbiter.mode is Mode.MOVING:
+            self.arbiter.enter(Mode.STANDING)
+        if not move.done.done():
+            move.done.set_result(move.recorder.result(outcome, path_time_s, self._commanded, cause))
+
+
+def _trigger_of(error: DockingError) -> Trigger:
+    """What a failed exchange with one controller means."""
+    if isinstance(error, LinkLost):
+        return Trigger.HEARTBEAT_LOST
+    silent = isinstance(error, DeviceSilent | BadReply | OutcomeUnknown)
+    return Trigger.FEEDBACK_MISSING if silent else Trigger.DRIVE_FAULT
 
 
 def _defect(error: Exception) -> Defect:

@@ -110,6 +110,10 @@ class QueuedFake:
 
     def __init__(self, axes: tuple[str, ...], start_mm: Array, segment_s: float = 0.1, ramp_s: float = 0.5) -> None:
         self.axes, self.segment_s, self.ramp_s = axes, segment_s, ramp_s
+        self.quick_ramp_s = 0.04
+        self.on_lost = lambda: None
+        self.braked = self.silent = False
+        self.rate = 1.0
         self.verbs: list[str] = []
         self.changes: dict[str, object] = {}
         self.offset_mm = np.zeros(len(axes))
@@ -118,6 +122,7 @@ class QueuedFake:
         self.loaded: Plan | None = None
         self._start_mm = start_mm
         self._path_s = self._rate = self._goal = self._seen_s = 0.0
+        self._slope_s = ramp_s
 
     async def bring_up(self) -> tuple[Identity, ...]:
         return (Identity("positioner A", "fake", "PLC", "1", "1"),)
@@ -135,17 +140,29 @@ class QueuedFake:
         if verb == "resume" and not (self._rate == 0.0 and self._goal == 0.0):
             raise DeviceRefused("positioner A", "resume while it is stopping", value=4)
         self.verbs.append(verb)
-        self._goal = 1.0 if verb in ("run", "resume") else 0.0
+        self._goal = self.rate if verb in ("run", "resume") else 0.0
+        self._slope_s = self.quick_ramp_s if verb == "quick-stop" else self.ramp_s
         if verb == "run":
-            self._rate = 1.0
+            self._rate = self.rate
+        if verb == "quick-stop":
+            self.braked = True
 
-    async def poll(self) -> Feedback:
+    async def override(self, rate: float) -> None:
+        assert self._rate == 0.0, "the rate changes at standstill only"
+        self.verbs.append(f"rate {rate:g}")
+        self.rate = rate
+
+    def go_silent(self) -> None:
+        self.silent = True
+
+    async def poll(self, *, surviving: bool = False) -> Feedback:
         if self.error is not None:
             raise self.error
         self._advance()
         stopping = self._goal < self._rate
         states = (AxisState.STOPPING if stopping else AxisState.ENABLED,) * len(self.axes)
-        fields = {"states": states, "path_time_s": self._path_s if self.loaded is not None else float("nan")}
+        path_s = self._path_s if self.loaded is not None else float("nan")
+        fields = {"states": states, "path_time_s": path_s, "t_s": asyncio.get_running_loop().time()}
         return read_back(self.position_mm() + self.offset_mm, **(fields | self.changes))
 
     async def close(self) -> None:
@@ -161,7 +178,7 @@ class QueuedFake:
         while self._seen_s < now_s - 1e-9:
             step_s = min(0.01, now_s - self._seen_s)
             before = self._rate
-            change = np.clip(self._goal - before, -step_s / self.ramp_s, step_s / self.ramp_s)
+            change = np.clip(self._goal - before, -step_s / self._slope_s, step_s / self._slope_s)
             self._rate = self._goal if abs(self._goal - before - change) < 1e-9 else before + float(change)
             self._path_s += 0.5 * (before + self._rate) * step_s
             self._seen_s += step_s
