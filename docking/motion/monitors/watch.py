@@ -211,9 +211,9 @@ class Watch:
     ) -> Finding | None:
         """Judge without the figure, a few times: a late read-back beside fresh ones would look like a squeezed part."""
         self._late_in_a_row += 1
-        finding = self._loads.judge(
-            feedback.force_n, feedback.t_s, q_ref_mm, moving=moving
-        ) or self._travel.following(feedback.following_error_mm, speed_mm_s)
+        finding = self._loads.judge(feedback.force_n, feedback.t_s, q_ref_mm, moving=moving) or self._travel.following(
+            feedback.following_error_mm, speed_mm_s
+        )
         if finding is None and self._late_in_a_row > LATE_IN_A_ROW:
             finding = self._figure(feedback.position_mm, q_ref_mm)
         if finding is None:

@@ -182,7 +182,16 @@ def test_attitude_changes_what_is_expected(axis):
     assert still.twice(resting(), q=q) is not None
 
 
-@pytest.mark.parametrize(("share", "trigger"), [(1.099, None), (1.101, Trigger.OVERLOAD), (0.501, None), (0.499, Trigger.UNDERLOAD), (-0.5, Trigger.UNDERLOAD)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("share", "trigger"),
+    [
+        (1.099, None),
+        (1.101, Trigger.OVERLOAD),
+        (0.501, None),
+        (0.499, Trigger.UNDERLOAD),
+        (-0.5, Trigger.UNDERLOAD),
+    ],
+)
 @pytest.mark.parametrize("ball", [1, 3])
 @pytest.mark.parametrize("moving", [True, False])
 def test_each_ball_carries_about_its_share(share, trigger, ball, moving):
