@@ -75,7 +75,7 @@ class Preview:
                 scene=Scene(here, self._mate, self._docked, stage.standoff_mm, before_mm),
             )
             plan = make_plan(request, self.positioners, self.settings)
-            yield StageMove(stage, plan, jam_bound(self.positioners, q_mm, self.settings.jam))
+            yield StageMove(stage, plan, jam_bound(self.positioners, plan.q_mm[[0, -1]], self.settings.jam))
             here, q_mm, before_mm = moved_pose(here, correction), plan.q_mm[-1], stage.standoff_mm
 
     def _station(self, standoff_mm: float) -> Pose:

@@ -122,8 +122,10 @@ class JamBound:
 
 
 def jam_bound(positioners: Positioners, q_mm: Array, settings: JamSettings) -> JamBound:
-    """The bound for balls near where the sockets are at `q_mm` (m,); good for the few degrees of a docking."""
-    balls = socket_positions(positioners, q_mm)
-    residual = _largest_norms(residual_matrix(positioners, balls))
-    force = _largest_norms(internal_force_matrix(positioners, balls))
-    return JamBound(positioners.axes, residual, force, positioners.a_quick_mm_s2, settings)
+    """The bound over places of the axes `q_mm` (m,) or (n, m): of each axis the worst of them. The start, the middle
+    and the end of a path are enough for the few degrees of a docking."""
+    places = [socket_positions(positioners, row) for row in np.atleast_2d(q_mm)]
+    residual = [_largest_norms(residual_matrix(positioners, balls)) for balls in places]
+    force = [_largest_norms(internal_force_matrix(positioners, balls)) for balls in places]
+    worst = np.max(residual, axis=0), np.max(force, axis=0)
+    return JamBound(positioners.axes, *worst, positioners.a_quick_mm_s2, settings)

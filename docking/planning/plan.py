@@ -47,7 +47,7 @@ def make_plan(request: PlanRequest, positioners: Positioners, settings: PlanSett
     path = rigid_path(positioners, request.q_now_mm, request.correction)
     room = check_strokes(path, positioners, settings)
     check_attitudes(pose_from_axes(positioners, request.q_now_mm), request.correction, positioners, settings)
-    jam = jam_bound(positioners, request.q_now_mm, settings.jam)
+    jam = jam_bound(positioners, path.axes_mm(np.array([0.0, 0.5, 1.0])), settings.jam)
     limits = PaceLimits(positioners, request.speed_mm_s, request.period_s, request.linear_interpolation, settings, jam)
     law, limited_by = fastest_law(path, limits)
     t_s = request.period_s * np.arange(round(law.duration_s / request.period_s) + 1, dtype=np.float64)
@@ -73,21 +73,23 @@ def make_plan(request: PlanRequest, positioners: Positioners, settings: PlanSett
         rate_slew_per_s=rate_slew_per_s(path, law, limits),
         speed_limited_by=limited_by,
         margins=margins,
-        bounds=_bounds(request, path, law, limits, s, peak),
+        bounds=_bounds(request, path, (law, limited_by), limits, s, peak),
     )
 
 
 def _bounds(
-    request: PlanRequest, path: RigidPath, law: TimeLaw, limits: PaceLimits, s: Array, peak_mm_s: Array
+    request: PlanRequest, path: RigidPath, paced: tuple[TimeLaw, str], limits: PaceLimits, s: Array, peak_mm_s: Array
 ) -> PlanBounds:
-    """What is foreseen of the timed move; raises what that forbids."""
+    """What is foreseen of the timed move; raises what that forbids. `paced`: the law and the limit that sets it."""
+    law, limited_by = paced
     jam, settings = limits.jam, limits.settings
     quick_stop_s = jam.quick_stop_s(peak_mm_s)
     clear = Clearance()
     if request.scene is not None:
         clear = check_mate(request.scene, request.correction, law, settings.mate, quick_stop_s)
     strain = foreseen_strain(path, s, limits.positioners, settings, law.duration_s)
-    used = sorted(((name, factor) for factor, name in limits.stretches(path, law)), key=lambda item: -item[1])
+    used = [(name, factor) for factor, name in limits.stretches(path, law)]
+    used.sort(key=lambda item: (item[0] != limited_by, -item[1]))
     return PlanBounds(
         peak_mm_s=peak_mm_s,
         quick_stop_s=quick_stop_s,
