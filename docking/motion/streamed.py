@@ -124,6 +124,9 @@ class StreamedMotion:
         self._loaded = None
         await self._bus.arm_stops(stop.peak_mm_s, stop.t_stop_s)
         self._refuse()
+        # Axes without a set-point stand where the component has taken them: the plan begins there.
+        self._setpoint = readonly(np.where(self._watch.driven, self._setpoint, plan.q_mm[0]))
+        self._history.extend([self._setpoint] * 2)
         self._watch.watch_about(plan.q_mm[0], relief=plan.kind == "relief")
         self._quick_stop_s = stop.t_stop_s + QUICK_STOP_S
         self._loaded = Playback(plan, self._share), stop
