@@ -65,7 +65,8 @@ class Drifting:
         self._position = position
 
     def feedback(self):
-        return read_back(self._position(asyncio.get_running_loop().time()))
+        now_s = asyncio.get_running_loop().time()
+        return read_back(self._position(now_s), t_s=now_s)
 
 
 def settled_at(position, settings=SETTINGS) -> float:
