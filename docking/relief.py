@@ -17,15 +17,15 @@ from docking import records
 from docking.errors import DockingError, ForceRose, ForeignForce, NotRelieved, PermissiveMissing, PlanStale
 from docking.kinematics import Positioners
 from docking.motion.settle import SettleSettings
-from docking.motion.weighing import PAUSE_S, weigh
+from docking.motion.weighing import weigh
 from docking.planning import PlanSettings
 from docking.planning.relief import ReliefSettings, Scales, StepRequest, Strain, Tare, Weighing, relief_plan
 from docking.ports import Journal, Motion, Operator
 from docking.state import Effect, Event
 from docking.types import Alarm, Array, MoveResult, Plan
 
-GUARD_READINGS = 4
-"""Read-backs that the guard of a running step averages: two tenths of a second, 0.02 mm at the most."""
+GUARD_READINGS, GUARD_PAUSE_S = 2, 0.02
+"""Readings that the guard of a running step averages, as often as load cells report."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,9 +111,9 @@ class Relief:
         scales = Scales(run.positioners, run.plan, run.relief, weighing.position_mm)
         strain = scales.strain(weighing, run.tare)
         self._keep(strain, weighing)
-        self._check_foreign(strain)
         if p.strain is not None:
             self._check_rise(scales, p.strain, strain)
+        self._check_foreign(strain)
         p.weighing, p.strain, p.first = weighing, strain, p.first or strain
         if self._relieved(strain):
             return Event.RELIEVED
@@ -230,7 +230,7 @@ class Relief:
         latest: list[Array] = []
         to_balls = np.transpose(self.run.positioners.axes_inverse, (0, 2, 1))
         while True:
-            await asyncio.sleep(PAUSE_S)
+            await asyncio.sleep(GUARD_PAUSE_S)
             latest = [*latest[1 - GUARD_READINGS :], self.motion.feedback().force_n]
             if len(latest) < GUARD_READINGS:
                 continue

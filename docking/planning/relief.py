@@ -15,7 +15,7 @@ from math import ceil, sqrt
 import numpy as np
 
 from docking.errors import LoadCellSilent, PlanInputInvalid, StrokeExceeded
-from docking.kinematics import Positioners, axis_jacobian, ball_reactions_n, pose_from_axes
+from docking.kinematics import Positioners, axis_forces_n, axis_jacobian, ball_reactions_n, pose_from_axes
 from docking.kinematics.forces import axis_stiffness_n_per_mm
 from docking.planning.jam import jam_bound
 from docking.planning.preflight import check_table
@@ -47,7 +47,8 @@ class ReliefSettings:
     `speed_mm_s` of any axis; `share` of the internal force that one step takes away at most; `rise` that aborts, as a
     fraction of a ball's force before; `seated_mm`: how finely axes come to rest, and how true the sockets stood to the
     balls when the part was taken; `stalled_steps` without any fall end the relief; a mode of internal force counts
-    from `significant_sigmas` on; without a tare the load cells have drifted for `powered_h`.
+    from `significant_sigmas` on; without a tare the load cells have drifted for `powered_h`; since a
+    tare the weight is known to `foreign_share` of a ball's equal share.
     """
 
     cells: LoadCellErrors
@@ -61,6 +62,7 @@ class ReliefSettings:
     stalled_steps: int = 3
     significant_sigmas: float = 2.0
     powered_h: float = 1.0
+    foreign_share: float = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,13 +142,14 @@ class Scales:
             bias, rest = self._own_error(tare, weighing)
         internal = self._projector @ (weighing.force_n - bias - self._positioners.held_n)
         told, spread = self._told_apart(internal, rest)
+        foreign, limit = self._foreign(weighing, tare)
         return Strain(
             internal_n=told,
             ball_n=np.linalg.norm(self.at_balls(told), axis=1),
             sigma_n=spread,
             force_n=np.linalg.norm(self.at_balls(weighing.force_n), axis=1),
-            foreign_n=self._foreign(weighing.force_n),
-            foreign_limit_n=self._foreign_limit(sigma),
+            foreign_n=foreign,
+            foreign_limit_n=limit,
         )
 
     def at_balls(self, axis_forces_n: Array) -> Array:
@@ -211,20 +214,40 @@ class Scales:
         spread = (self._projector * sigma_n).reshape(-1, 3, len(sigma_n))
         return told, float(np.sqrt((spread**2).sum(axis=(1, 2)).max()))
 
-    def _foreign(self, force_n: Array) -> Array:
-        weight = self._load.mass_kg * self._load.gravity_m_s2
-        expected = ball_reactions_n(self._positioners, self._balls, self._coms[0], weight)[0]
-        along = np.einsum("kji,kj->ki", self._positioners.axes_W, expected).reshape(-1)
-        result: Array = np.linalg.norm(self.at_balls(self._rigid @ (force_n - along)), axis=1)
-        return result
+    def _foreign(self, now: Weighing, tare: Tare | None) -> tuple[Array, Array]:
+        """The part of each ball's force (k,) that neither weight nor strain explains, and its limit (k,).
 
-    def _foreign_limit(self, sigma_n: Array) -> Array:
-        nominal = ball_reactions_n(self._positioners, self._balls, self._coms, self._load.heaviest_n)
-        weight = self._load.mass_kg * self._load.gravity_m_s2
-        expected = ball_reactions_n(self._positioners, self._balls, self._coms[0], weight)[0]
-        tolerance = np.linalg.norm(nominal - expected, axis=2).max(axis=0)
-        spread = (self._rigid * sigma_n).reshape(-1, 3, len(sigma_n))
-        result: Array = tolerance + 3.0 * np.sqrt((spread**2).sum(axis=(1, 2)))
+        With a tare only what has changed since then counts: the weight itself, and what the load cells add, drop out.
+        """
+        expected = self._expected_n(now.position_mm)
+        if tare is None:
+            change, sigma = now.force_n - expected, self._sigma(now, self._relief.powered_h)
+            tolerance = self._load_tolerance_n()
+        else:
+            before = tare.weighing
+            change = now.force_n - before.force_n - expected + self._expected_n(before.position_mm)
+            moved = Weighing(now.position_mm, now.force_n - before.force_n, now.noise_n)
+            sigma = np.hypot(self._sigma(moved, tare.age_h), before.noise_n)
+            share = self._load.mass_kg * float(np.linalg.norm(self._load.gravity_m_s2)) / len(self._balls)
+            tolerance = np.full(len(self._balls), self._relief.foreign_share * share)
+        spread = (self._rigid * sigma).reshape(-1, 3, len(sigma))
+        limit: Array = tolerance + 3.0 * np.sqrt((spread**2).sum(axis=(1, 2)))
+        return np.linalg.norm(self.at_balls(self._rigid @ change), axis=1), limit
+
+    def _expected_n(self, q_mm: Array) -> Array:
+        """Forces along the axes (m,) that the weight needs with the axes at `q_mm` (m,)."""
+        positioners, load = self._positioners, self._load
+        X_WC = pose_from_axes(positioners, q_mm)
+        balls, com = X_WC.apply(positioners.balls_C_mm), X_WC.apply(load.com_C_mm)
+        reactions = ball_reactions_n(positioners, balls, com, load.mass_kg * load.gravity_m_s2)[0]
+        return axis_forces_n(positioners, reactions)
+
+    def _load_tolerance_n(self) -> Array:
+        """How far each ball's force (k,) may be from the expected by the tolerances of mass and centre of mass."""
+        positioners, load = self._positioners, self._load
+        nominal = ball_reactions_n(positioners, self._balls, self._coms[0], load.mass_kg * load.gravity_m_s2)
+        corners = ball_reactions_n(positioners, self._balls, self._coms, load.heaviest_n)
+        result: Array = np.linalg.norm(corners - nominal, axis=2).max(axis=0)
         return result
 
 

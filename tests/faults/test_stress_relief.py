@@ -10,7 +10,7 @@ import pytest
 from docking.state import Event, State
 from tests.support.strained_cell import ReliefCase, Strained, relieved, warp_mm
 
-SEEDS = [1, 2, pytest.param(3, marks=pytest.mark.full), *(pytest.param(s, marks=pytest.mark.full) for s in range(4, 13))]
+SEEDS = [1, *(pytest.param(seed, marks=pytest.mark.full) for seed in range(2, 13))]
 
 
 def assert_single_axes_moved_slowly(case: ReliefCase) -> None:
@@ -19,7 +19,7 @@ def assert_single_axes_moved_slowly(case: ReliefCase) -> None:
         assert plan["kind"] == "relief"
         assert max(map(abs, plan["displacement_mm"].values())) <= 0.05 * (1.0 + 1e-9)
     times_mm = np.array(case.position_mm)
-    assert np.abs(np.diff(times_mm, axis=0)).max() <= 0.1 * 0.05 + 0.004, "an axis went faster than 0.1 mm/s"
+    assert np.abs(np.diff(times_mm, axis=0)).max() <= 0.1 * 0.1 + 0.002, "an axis went faster than 0.1 mm/s"
     order = [kind for kind, _ in case.records if kind in ("confirm", "intent", "moved")]
     assert order == ["confirm", "intent", "moved"] * (len(order) // 3) + ["confirm"] * (len(order) % 3)
     assert all(body["supervisor"] == "A. Smith" for body in case.bodies("confirm"))
@@ -91,21 +91,20 @@ def test_it_moves_only_as_long_as_the_supervisor_asks(steps, tmp_path):
 @pytest.mark.parametrize("event", [Event.HOLD, Event.ABORT])
 def test_letting_go_in_a_step_stops_it(event, tmp_path):
     strained = Strained(
-        "lab-can",
+        "fuselage-can",
         1,
-        warp_mm("lab-can", "B.Z", 60.0),
+        warp_mm("fuselage-can", "B.Z", 1500.0),
         while_moving=lambda case: case.controller.post(event),
     )
     case = relieved(strained, tmp_path / "r.jsonl")
     assert case.state is State.RECOVER
-    (moved,) = case.bodies("moved")
-    plan = case.bodies("plan")[0]
+    (moved,), (plan,) = case.bodies("moved"), case.bodies("plan")
     assert moved["result"] == "stopped"
     assert 0.0 < moved["path_time_s"] < plan["duration_s"]
 
 
-def test_a_ball_whose_force_rises_ends_it(tmp_path):
-    """An axis runs away while a step runs: the guard stops the step, or the weighing after it names the ball."""
+def test_a_ball_whose_force_rises_stops_the_step(tmp_path):
+    """The load cell of a ball shows 900 N more while a step runs: the guard stops it on its way."""
 
     def push(case: ReliefCase) -> None:
         case.far.plant.misread_force("A.Z", 900.0)
@@ -114,7 +113,9 @@ def test_a_ball_whose_force_rises_ends_it(tmp_path):
     case = relieved(strained, tmp_path / "r.jsonl")
     assert case.state is State.FAULT
     assert case.alarms() == [(2131, "ball A")]
-    assert len(case.bodies("intent")) == 1
+    (moved,), (plan,) = case.bodies("moved"), case.bodies("plan")
+    assert moved["result"] == "stopped"
+    assert moved["path_time_s"] < plan["duration_s"]
 
 
 def test_an_axis_that_does_not_give_ends_it(tmp_path):
@@ -135,14 +136,16 @@ def test_an_axis_that_does_not_give_ends_it(tmp_path):
     assert len(case.bodies("intent")) <= 6
 
 
-def test_a_part_that_touches_something_is_not_pulled_against_it(tmp_path):
-    """300 N sideways at every ball are neither weight nor strain."""
+@pytest.mark.parametrize(("tared", "push_n"), [(True, 300.0), (False, 1500.0)])
+def test_a_part_that_touches_something_is_not_pulled_against_it(tared, push_n, tmp_path):
+    """The same push sideways at every ball is neither weight nor strain. Nothing moves."""
 
     def leaning(case: ReliefCase) -> None:
         for axis in ("A.Y", "B.Y", "C.Y", "D.Y"):
-            case.far.plant.misread_force(axis, 700.0)
+            case.far.plant.misread_force(axis, push_n)
 
-    strained = Strained("fuselage-can", 1, warp_mm("fuselage-can", "B.Z", 1500.0), each=leaning)
+    strained = Strained("fuselage-can", 1, warp_mm("fuselage-can", "B.Z", 1500.0), tared=tared, before=leaning)
     case = relieved(strained, tmp_path / "r.jsonl")
     assert case.state is State.FAULT
-    assert case.alarms()[0][0] in (2131, 2133)
+    assert case.alarms()[0][0] == 2133
+    assert not case.bodies("intent")

@@ -1,4 +1,4 @@
-"""A part that a stop has left strained, a supervisor who asks for steps, and the truth beside what the cell believes."""
+"""A part that a stop left strained, a supervisor who asks for steps, and the truth beside what the cell believes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from sim.wires.virtual_can import VirtualCan
 from sim.wires.virtual_serial import VirtualSerial
 from tests.support.dry_cell import CELLS, Tap, files
 
-SAMPLE_S = 0.05
+SAMPLE_S = 0.1
 
 
 class Supervisor(AutomaticOperator):
@@ -49,8 +49,8 @@ class Supervisor(AutomaticOperator):
 
 @dataclass
 class Strained:
-    """How the part is left: axes and how far they stand off (mm). `tared`: weighed before. `each` is called before
-    every answer of the supervisor, `while_moving` with the running cell half a second into every step."""
+    """How the part is left: axes and how far they stand off (mm). `tared`: weighed before. `before` is called before
+    the relief, `each` before every answer of the supervisor, `while_moving` early in every step."""
 
     name: str
     seed: int
@@ -58,6 +58,7 @@ class Strained:
     tared: bool = True
     steps: int = 100
     truth: Callable[[TruthFile], TruthFile] = lambda truth: truth
+    before: Callable[[ReliefCase], None] = lambda case: None
     each: Callable[[ReliefCase], None] = lambda case: None
     while_moving: Callable[[ReliefCase], None] | None = None
 
@@ -125,12 +126,13 @@ class ReliefCase:
             self.step_starts.append(len(self.ball_n))
             self.sample()
             if self.strained.while_moving is not None:
-                asyncio.get_running_loop().call_later(0.1, self.strained.while_moving, self)
+                asyncio.get_running_loop().call_later(0.05, self.strained.while_moving, self)
 
     async def run(self, journal: Path) -> None:
         tare = await self.tare() if self.strained.tared else None
         for axis, by_mm in self.strained.offsets_mm.items():
             self.far.plant.displace(axis, by_mm)
+        self.strained.before(self)
         wires, loop = self.wires(), asyncio.get_running_loop()
         tap = Tap(journal, loop.time)
         tap.hooks.append(self.heard)
