@@ -49,6 +49,12 @@ class CheckResult:
             },
             "axes": list(self.cell.axis_names),
             "driven": [name for name, on in zip(self.cell.axis_names, self.cell.driven, strict=True) if on],
+            "held_n": {
+                f"{p.name}.{axis.name}": axis.force_n
+                for p in self.cell.positioners
+                for axis in p.axes
+                if axis.force_n is not None
+            },
             **self._held(),
             **strain_json(self.cell, self.job),
             "features": [

@@ -42,8 +42,14 @@ def _bus(cell: CellFile) -> str:
 def _axes(cell: CellFile, job: JobFile) -> list[str]:
     found = conditioning(positioners_from(cell, job), rank_settings(cell))
     count, driven = len(cell.axis_names), sum(cell.driven)
-    passive = [name for name, on in zip(cell.axis_names, cell.driven, strict=True) if not on]
+    passive = [name for name, on in zip(cell.axis_names, cell.powered, strict=True) if not on]
     follow = f"; passive: {', '.join(passive)}" if passive else ""
+    follow += "".join(
+        f"; {p.name}.{axis.name} holds {axis.force_n:g} N +- {100.0 * axis.force_tolerance:g} %"
+        for p in cell.positioners
+        for axis in p.axes
+        if axis.force_n is not None
+    )
     pose = " ".join(f"{v:z.3f}" for v in pose_to_vector(docked_pose(cell, job)))
     rows = [
         f"axes: {count}, {driven} driven, redundancy {found.redundancy}, condition {found.condition:.2f} "
