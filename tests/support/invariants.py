@@ -23,10 +23,10 @@ HELD_MM = 0.002
 class Outcome:
     """What a case measured; times in s after the fault, NaN where it did not happen.
 
-    `reaction`: none (the plan ran to its end), path (slowed on the path), quick-stop, silence. `reacted_s` first changed
-    command, `standstill_s` last motion of a healthy axis. Worst `residual_mm` of the true motor positions, rise of the
-    true internal force `force_n` until 0.3 s after the fault, worst residual of the commands sent `streamed_mm`, worst
-    distance from the path in a quick stop `beside_mm`, `drift_mm` of the healthy axes afterwards.
+    `reaction`: none (the plan ran to its end), path (slowed on the path), quick-stop, silence. `reacted_s` first
+    changed command, `standstill_s` last motion of a healthy axis. Worst `residual_mm` of the true motor positions, rise
+    of the true internal force `force_n` until 0.3 s after the fault, worst residual of the commands sent `streamed_mm`,
+    worst distance from the path in a quick stop `beside_mm`, `drift_mm` of the healthy axes afterwards.
     """
 
     reaction: str
@@ -42,6 +42,7 @@ class Outcome:
 def judge(cell: ReadyCell, broken: str | None = None) -> Outcome:
     """Assert I1 to I7 for a move with a fault of axis `broken`; return what was measured."""
     healthy = np.array([axis != broken for axis in cell.cell.axis_names])
+    assert cell.cause is None or cell.again_refused, "after a fault the same move could be started again"
     sent = cell.record.sent()
     stopped_s = _quick_stop_s(cell, sent)
     streamed_mm = _assert_streamed(cell, sent, stopped_s)

@@ -1,6 +1,6 @@
-"""What happens on the drives' side of a CAN cell, tick by tick, and the invariants of the fault page that it must keep.
+"""What happens on the drives' side of a CAN cell, tick by tick, and where it stands beside its plan.
 
-Nothing of the controller's own mathematics is used: set-points are decoded from the frames, rigidity is judged by an SVD.
+Nothing of the controller's own mathematics is used: set-points are decoded from the frames, a figure is laid on by SVD.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class RecordedPlant:
 
 @dataclass
 class Sent:
-    """What left the controller: one row a SYNC. `word` (n, d) controlwords and `target_mm` (n, d) of the driven axes."""
+    """What left the controller, one row a SYNC: `word` (n, d) controlwords, `target_mm` (n, d) of the driven axes."""
 
     t_s: Array
     word: NDArray[np.int64]

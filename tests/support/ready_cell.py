@@ -48,6 +48,7 @@ class Scene:
     """How one case is set up: cell, seed of plant and plan, how the drives behave, the size of the move.
 
     `cell_changes` alters the cell file, `before` is called before bring-up; `enabled`: enable the axes and load a plan.
+    `errors_off` are true errors of the simulated cell that this case does without.
     """
 
     name: str = "lab-can"
@@ -59,6 +60,7 @@ class Scene:
     cell_changes: Callable[[CellFile], CellFile] | None = None
     before: Callable[[ReadyCell], None] | None = None
     enabled: bool = True
+    errors_off: tuple[str, ...] = ()
 
 
 class ReadyCell:
@@ -69,6 +71,7 @@ class ReadyCell:
         cell, self.job = production_files(scene.name)
         self.cell = scene.cell_changes(cell) if scene.cell_changes else cell
         truth = truth_of(CELLS / f"{scene.name}.toml")
+        truth = truth.model_copy(update={"errors": {**truth.errors, **dict.fromkeys(scene.errors_off, 0.0)}})
         self.positioners = positioners_from(self.cell, self.job)
         self.far: FarEnd = make_far_end(self.cell, self.job, truth, scene.seed)
         self.plant = self.far.plant
@@ -81,6 +84,7 @@ class ReadyCell:
         self.start_s = self.fault_s = float("nan")
         self.result: MoveResult | None = None
         self.refused: DockingError | None = None
+        self.again_refused = False
 
     async def open(self) -> None:
         """Join drives and controller; nothing is sent yet."""
@@ -125,14 +129,14 @@ class ReadyCell:
         )
         return a_plan(site, int(rng.integers(1000)), start_mm=standing_mm)
 
+    _fault: tuple[float, Callable[..., Any], tuple[Any, ...]] | None = None
+
     def during(self, share: float, fault: Callable[..., Any], *args: Any) -> None:
         """Let a fault happen after this share of the move's time; before `move`."""
         self._fault = share, fault, args
 
-    _fault: tuple[float, Callable[..., Any], tuple[Any, ...]] | None = None
-
-    async def move(self, verb: str | None = None) -> None:
-        """Write the intent, start, wait for the end, watch for a while."""
+    async def move(self) -> None:
+        """Write the intent, start, wait for the end, watch for a while, and try to start again in between."""
         self.write("intent", records.intent_record(self.plan))
         self.start_s = self.loop.time()
         if self._fault is not None:
@@ -146,7 +150,13 @@ class ReadyCell:
         except DockingError as error:
             self.refused = error
         self.ended_s = self.loop.time()
-        await asyncio.sleep(QUIET_S)
+        await asyncio.sleep(0.5 * QUIET_S)
+        try:
+            await self.motion.load(self.plan)
+            await self.motion.start(self.plan.plan_hash)
+        except DockingError:
+            self.again_refused = True
+        await asyncio.sleep(0.5 * QUIET_S)
 
     def write(self, kind: str, body: dict[str, Any]) -> None:
         self.journal.append((self.loop.time(), kind, body))

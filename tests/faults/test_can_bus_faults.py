@@ -1,0 +1,355 @@
+"""Rows CAN-01 to CAN-16: what happens on the bus while a part is moved."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from docking.config import CellFile
+from docking.errors import (
+    AxisNotEnabled,
+    ConsistencyTrip,
+    DeviceRefused,
+    DeviceSilent,
+    DockingError,
+    DriveFault,
+    DriveWarning,
+    EnableFailed,
+    FeedbackMissing,
+    FollowingErrorTrip,
+    InternalForceTrip,
+    LinkLost,
+    ReadBackMismatch,
+    TickLate,
+    WrongIdentity,
+)
+from sim.canopen.drives import Stage
+from sim.canopen.settings import DriveSettings
+from sim.virtual_time import run_virtual
+from tests.support.fault_rows import Row, T, params, run_row
+from tests.support.invariants import HELD_MM, judge
+from tests.support.motion_record import ENABLED, QUICK_STOP
+from tests.support.ready_cell import ReadyCell, Scene, play
+
+COUPLING = (ConsistencyTrip, InternalForceTrip, FollowingErrorTrip)
+SILENCE_S = 0.28
+"""1016h of the drives: so long after the last heartbeat they stop by themselves."""
+
+
+def lost_read_backs(count: float):
+    return lambda cell: cell.faults.lose_read_back("B.X", count)
+
+
+def cut(cell: ReadyCell) -> None:
+    cell.bus.cut("the controller went bus-off")
+
+
+def queue_full(cell: ReadyCell) -> None:
+    cell.near.drop("cannot send: no buffer space available")
+
+
+def deaf(cell: ReadyCell) -> None:
+    """The receiving side of the controller dies without a word."""
+    cell.near.on_frames = lambda frames: None
+
+
+ROWS = [
+    Row("CAN-01-cut", cut, (LinkLost,), "can0", ("silence",), 2 * T, still_s=SILENCE_S + 0.1),
+    Row(
+        "CAN-01-without-a-word",
+        lambda cell: cell.faults.wire.silence(),
+        (FeedbackMissing, LinkLost),
+        "",
+        ("quick-stop", "silence"),
+        4 * T,
+        still_s=SILENCE_S + 0.1,
+    ),
+    Row("CAN-02", lost_read_backs(float("inf")), (FeedbackMissing,), "B.X", ("path", "quick-stop"), 4 * T),
+    Row("CAN-02-three", lost_read_backs(3), (FeedbackMissing,), "B.X", ("path", "quick-stop"), 4 * T, full=True),
+    Row("CAN-05-warning", lambda c: c.faults.warn("B.X", 0x4210), (DockingError,), "too hot", ("path",), T),
+    Row("CAN-05-generic", lambda c: c.faults.warn("D.Z", 0x1000), (DockingError,), "D.Z", ("path",), T, full=True),
+    Row(
+        "CAN-05-fault",
+        lambda c: c.group.trip("B.X", 0x2310),
+        (DriveFault,),
+        "overcurrent",
+        ("quick-stop",),
+        T,
+        broken="B.X",
+    ),
+    Row("CAN-06", lambda c: c.faults.lose_heartbeat("B.X"), (DockingError,), "B.X", ("quick-stop",), 0.4 + T),
+    Row("CAN-06-mute", lambda c: c.group.mute("C.Y"), (FeedbackMissing,), "C.Y", ("quick-stop",), 4 * T, broken="C.Y"),
+    Row("CAN-07", lambda c: c.group.restart("B.X"), (DockingError,), "restarted", ("quick-stop",), T, broken="B.X"),
+    Row(
+        "CAN-07-loaded",
+        lambda c: c.group.restart("B.Z"),
+        (DockingError,),
+        "restarted",
+        ("quick-stop",),
+        T,
+        broken="B.Z",
+        full=True,
+    ),
+    Row(
+        "CAN-09",
+        lambda c: c.faults.forge_set_point("B.X", 0.0),
+        (DockingError,),
+        "another sender",
+        ("quick-stop",),
+        T,
+        broken="B.X",
+    ),
+    Row("CAN-10", deaf, (FeedbackMissing,), "", ("quick-stop",), 4 * T),
+    Row(
+        "CAN-13",
+        lambda c: c.faults.leave_operational("B.X"),
+        (DockingError,),
+        "B.X",
+        ("quick-stop",),
+        4 * T,
+        broken="B.X",
+    ),
+    Row("CAN-16", queue_full, (LinkLost,), "no buffer space", ("silence",), 2 * T, still_s=SILENCE_S + 0.1),
+]
+
+
+@pytest.mark.parametrize("row", params(ROWS))
+def test_a_fault_on_the_bus(row):
+    run_row(row)
+
+
+@pytest.mark.parametrize("cycles", [1, 2])
+def test_can_02_read_backs_missed_as_often_as_is_permitted_stop_nothing(cycles):
+    cell = play(Scene(), lambda cell: cell.during(0.5, cell.faults.lose_read_back, "B.X", cycles))
+    assert judge(cell).reaction == "none"
+    assert cell.result.result == "done"
+
+
+def test_can_03_one_lost_set_point_is_made_up_for():
+    cell = play(Scene(), lambda cell: cell.during(0.5, cell.faults.lose_set_points, "B.X", 1))
+    outcome = judge(cell)
+    assert (cell.result.result, outcome.reaction) == ("done", "none")
+    # One cycle at 2.9 mm/s.
+    assert 0.003 < outcome.residual_mm <= 0.03
+
+
+def test_can_03_set_points_that_do_not_arrive_stop_all():
+    """The drive stands at its last target and reports no following error: the figure of the others leaves it."""
+    cell = play(Scene(), lambda cell: cell.during(0.5, cell.faults.lose_set_points, "B.X"))
+    outcome = judge(cell, "B.X")
+    assert isinstance(cell.cause, DockingError)
+    assert "B.X" in str(cell.cause)
+    assert outcome.reaction == "path"
+    limit_mm = cell.cell.limits.ball_residual_mm + 0.05
+    assert outcome.residual_mm <= limit_mm
+    assert outcome.force_n <= 1.5 * cell.cell.limits.internal_force_n
+
+
+@pytest.mark.parametrize("reaction", ["hold", "extrapolate", "quick-stop", "fault"])
+def test_can_01_drives_that_hear_nothing_stop_by_their_own_watchdog(reaction):
+    """Whatever a drive does when SYNC stops: 1016h brings it to rest, straight, as 6085h was written for this plan."""
+    scene = Scene(drives=DriveSettings(sync_loss=reaction))
+    cell = play(scene, lambda cell: cell.during(0.5, cut, cell))
+    t_s, motor = cell.record.motors(cell.start_s)
+    last_beat_s = max(beat for beat in cell.record.beats_s if beat <= cell.fault_s)
+    moving = np.abs(np.diff(motor, axis=0)).max(axis=1) > 2e-4
+    rest_s = t_s[1:][moving].max()
+    assert rest_s - last_beat_s <= 0.3 + 0.1
+    gap = cell.record.figure_gap_mm(motor, motor[0]).max()
+    print(reaction, "rest after the last heartbeat", rest_s - last_beat_s, "residual", gap)
+    assert gap <= 0.02
+    assert isinstance(cell.cause, LinkLost)
+
+
+def late_ticks(cell: ReadyCell, late_s, times: int) -> None:
+    """The next ticks of the controller come late."""
+    motion, left = cell.motion, [times]
+
+    def late() -> None:
+        if left[0] > 0:
+            left[0] -= 1
+            motion._timer = cell.loop.call_later(late_s(), type(motion)._tick, motion)
+        else:
+            del motion._tick
+            motion._tick()
+
+    motion._tick = late
+
+
+@pytest.mark.parametrize("jitter_s", [0.0001, 0.001, 0.004])
+def test_can_04_jitter_inside_half_a_cycle_stops_nothing(jitter_s):
+    rng = np.random.default_rng(4)
+
+    def begin(cell: ReadyCell) -> None:
+        late_ticks(cell, lambda: float(rng.uniform(0.0, jitter_s)), 50)
+
+    cell = play(Scene(), lambda cell: cell.during(0.2, begin, cell))
+    assert cell.result.result == "done"
+    _, motor = cell.record.motors(cell.start_s)
+    assert cell.record.figure_gap_mm(motor, motor[0]).max() <= 0.002
+
+
+@pytest.mark.parametrize("late_s", [0.025, 0.05])
+def test_can_04_a_tick_that_comes_too_late_stops_on_the_path(late_s):
+    cell = play(Scene(), lambda cell: cell.during(0.5, late_ticks, cell, lambda: late_s, 1))
+    # The drives notice the missing SYNC at the same time and say so.
+    assert isinstance(cell.cause, TickLate | AxisNotEnabled | DriveFault | DriveWarning)
+    assert cell.result.result == "fault"
+    _, motor = cell.record.motors(cell.start_s)
+    assert cell.record.figure_gap_mm(motor, motor[0]).max() <= 0.02
+
+
+def test_can_04_sync_that_stays_away_from_the_drives_stops_all():
+    cell = play(Scene(), lambda cell: cell.during(0.5, cell.faults.lose_sync))
+    outcome = judge(cell)
+    assert outcome.reaction in ("path", "quick-stop")
+    assert outcome.reacted_s <= 4 * T
+    assert outcome.residual_mm <= 0.02
+
+
+def test_can_04_one_drive_that_misses_its_sync_takes_the_others_along():
+    row = Row(
+        "CAN-04-alone",
+        lambda cell: cell.faults.stop_alone("B.X"),
+        (DockingError,),
+        "B.X",
+        ("quick-stop",),
+        2 * T,
+        broken="B.X",
+    )
+    _, outcome = run_row(row)
+    assert outcome.residual_mm <= 0.1
+
+
+# before anything moves -------------------------------------------------------------------------------------------
+async def bring_up_and_enable(cell: ReadyCell) -> None:
+    await cell.motion.connect()
+    await cell.motion.enable()
+
+
+def refused(scene: Scene, before) -> tuple[ReadyCell, DockingError]:
+    """The error that refuses to bring up or to enable a cell after `before(cell)`, and that nothing moved by then."""
+
+    async def main() -> tuple[ReadyCell, DockingError]:
+        cell = ReadyCell(scene)
+        await cell.open()
+        before(cell)
+        with pytest.raises(DockingError) as caught:
+            await bring_up_and_enable(cell)
+        cell.start_s = 0.0
+        await cell.close()
+        return cell, caught.value
+
+    cell, error = run_virtual(main)
+    moved = [np.abs(tick.motor_mm - cell.recorded.ticks[0].motor_mm).max() for tick in cell.recorded.ticks]
+    assert max(moved, default=0.0) <= HELD_MM
+    assert not any(tick.powered.any() and not tick.braked.all() for tick in cell.recorded.ticks[-3:])
+    assert not (cell.record.sent().word[-1:] == ENABLED).any()
+    return cell, error
+
+
+def with_serial_numbers(cell: CellFile) -> CellFile:
+    """Every drive must show the serial number that was noted at commissioning."""
+    stations = tuple(
+        station.model_copy(
+            update={
+                "axes": tuple(
+                    axis.model_copy(update={"serial_number": 402_000 + (axis.node or 0)}) for axis in station.axes
+                )
+            }
+        )
+        for station in cell.positioners
+    )
+    return cell.model_copy(update={"positioners": stations})
+
+
+def test_can_06_a_node_that_never_sent_a_heartbeat_is_not_enabled():
+    _, error = refused(Scene(), lambda cell: cell.faults.lose_heartbeat("B.Y"))
+    assert isinstance(error, DeviceSilent)
+    assert "B.Y" in str(error)
+
+
+def test_can_08_two_drives_in_each_others_place_are_not_enabled():
+    scene = Scene(cell_changes=with_serial_numbers)
+    _, error = refused(scene, lambda cell: cell.faults.swap("A.X", "B.X"))
+    assert isinstance(error, WrongIdentity)
+    assert "A.X" in str(error)
+
+
+def test_can_08_two_devices_with_one_number_are_not_enabled():
+    _, error = refused(Scene(), lambda cell: cell.faults.twin("C.Z"))
+    assert isinstance(error, WrongIdentity)
+    assert "C.Z" in str(error)
+
+
+PROTECTING = [(0x1016, 1), (0x605A, 0), (0x6085, 0), (0x605E, 0), (0x6007, 0), (0x607D, 1), (0x6065, 0), (0x60C2, 1)]
+
+
+@pytest.mark.parametrize(
+    ("answer", "obj", "sub"),
+    [
+        pytest.param(
+            answer, *address, id=f"{answer}-{address[0]:X}", marks=[pytest.mark.full] if (number + k) % 4 else []
+        )
+        for number, address in enumerate(PROTECTING)
+        for k, answer in enumerate(("refuse_write", "ignore_write"))
+        # 605Eh leaves the factory as it is wanted.
+        if (answer, address[0]) != ("ignore_write", 0x605E)
+    ],
+)
+def test_a_drive_that_does_not_take_what_protects_the_part_is_not_enabled(answer, obj, sub):
+    _, error = refused(Scene(), lambda cell: getattr(cell.faults, answer)("D.Y", obj, sub))
+    assert isinstance(error, DeviceRefused if answer == "refuse_write" else ReadBackMismatch)
+    assert "D.Y" in str(error)
+    assert f"{obj:04X}" in str(error)
+
+
+def test_can_11_the_first_set_points_are_where_the_axes_stand():
+    cell = play(Scene(), lambda cell: None)
+    sent = cell.record.sent()
+    first = int(np.argmax((sent.word == ENABLED).any(axis=1)))
+    t_s, motor = cell.record.motors()
+    standing = motor[np.searchsorted(t_s, sent.t_s[first]) - 1]
+    assert np.abs(sent.target_mm[first] - standing).max() <= 0.01
+
+
+def test_can_11_an_axis_that_is_not_where_its_first_set_point_is_keeps_all_off():
+    def jump_when_switched_on(cell: ReadyCell) -> None:
+        enter = cell.group.drives._enter
+
+        def hook(index, stage, t_s, **rest) -> None:
+            enter(index, stage, t_s, **rest)
+            if index == 4 and stage is Stage.OPERATION:
+                cell.faults.misread("B.Y", offset_mm=0.3)
+
+        cell.group.drives._enter = hook
+
+    _, error = refused(Scene(), jump_when_switched_on)
+    assert isinstance(error, EnableFailed | ReadBackMismatch)
+    assert "B.Y" in str(error)
+
+
+def test_can_12_a_stop_is_not_overwritten_by_the_next_cycles():
+    cell = play(Scene(), lambda cell: cell.during(0.5, cell.group.trip, "B.X", 0x2310))
+    sent = cell.record.sent()
+    told = int(np.argmax((sent.word == QUICK_STOP).all(axis=1)))
+    after = sent.word[told : told + 90]
+    assert len(after) == 90
+    assert (after != ENABLED).all()
+    assert not ((after[:-1] != QUICK_STOP) & (after[1:] == QUICK_STOP)).any()
+
+
+def test_can_14_and_15_a_fault_is_reset_by_order_only_and_the_edge_is_held():
+    async def story(cell: ReadyCell) -> None:
+        cell.during(0.5, cell.group.trip, "B.X", 0x2310)
+        await cell.move()
+        assert not (cell.record.sent().word & 0x80).any()
+        with pytest.raises(DockingError):
+            await cell.motion.enable()
+        assert not (cell.record.sent().word & 0x80).any()
+        with pytest.raises(DockingError):
+            await cell.motion.start(cell.plan.plan_hash)
+        assert cell.group.drives.stages[cell.index("B.X")] is Stage.FAULT
+
+    cell = play(Scene(), story)
+    assert isinstance(cell.cause, DriveFault)
