@@ -65,6 +65,9 @@ class Everything:
     def request(self, verb: str) -> None:
         self.requests.append((asyncio.get_running_loop().time(), verb))
 
+    def override(self, percent: float) -> None:
+        self.requests.append((asyncio.get_running_loop().time(), f"{percent:g} %"))
+
     def alarm(self, error: Exception) -> None:
         self.alarms.append(error)
 
@@ -257,3 +260,87 @@ def test_a_cancelled_run_closes_the_devices():
 
     run_virtual(main)
     assert parts.closed == 1
+
+
+def relieve(parts: Everything, *posts: tuple[float, Event]) -> State:
+    """Relieve with events posted at their times."""
+
+    async def main() -> State:
+        cell = Cell(parts)
+        for at_s, event in posts:
+            asyncio.get_running_loop().call_later(at_s, cell.post, event)
+        return await asyncio.wait_for(cell.relieve(), 1000.0)
+
+    return run_virtual(main)
+
+
+@pytest.mark.parametrize("steps", [0, 1, 3])
+def test_a_relief_steps_until_the_part_is_relieved_and_ends_idle(steps):
+    answers = iter([Event.STEP_ASKED] * steps + [Event.RELIEVED])
+
+    async def weighed() -> Event:
+        return next(answers)
+
+    parts = Everything(WEIGH=weighed, STEP=Event.MOVED)
+    assert relieve(parts) is State.IDLE
+    assert parts.began.count(Effect.STEP) == steps
+    assert Effect.LOCATE not in parts.began
+    assert parts.closed == 1
+
+
+@pytest.mark.parametrize("event", [Event.HOLD, Event.ABORT])
+def test_letting_go_in_a_relief_step_stops_the_axes(event):
+    async def stopping() -> Event:
+        await asyncio.sleep(1.0)
+        return Event.STOPPED
+
+    parts = Everything(WEIGH=Event.STEP_ASKED, STEP=stopping)
+    assert relieve(parts, (3.0 + 1.5, event)) is State.RECOVER
+    assert [verb for _, verb in parts.requests] == ["stop"]
+
+
+def test_an_abort_before_the_step_moves_nothing():
+    parts = Everything(WEIGH=Event.STEP_ASKED)
+    assert relieve(parts, (2.5, Event.ABORT)) is State.RECOVER
+    assert Effect.STEP not in parts.began
+    assert parts.requests == []
+
+
+@pytest.mark.parametrize(("percents", "last"), [((50.0, 20.0), "request"), ((50.0, 80.0), "write")])
+def test_slower_is_passed_on_before_it_is_recorded_and_faster_after(percents, last):
+    parts, order = Everything(), []
+    write, override = parts.write, parts.override
+    parts.write = lambda kind, body, **how: (order.append("write"), write(kind, body))
+    parts.override = lambda percent: (order.append("request"), override(percent))
+
+    async def main() -> Cell:
+        cell = Cell(parts)
+        for percent in percents:
+            order.clear()
+            cell.override(percent)
+        return cell
+
+    cell = run_virtual(main)
+    assert order == [last, "write" if last == "request" else "request"]
+    assert [verb for _, verb in parts.requests] == [f"{p:g} %" for p in percents]
+    assert [body["percent"] for kind, body in parts.records if kind == "command"] == list(percents)
+    assert cell.percent == percents[-1]
+
+
+def test_a_blocked_view_is_measured_again_or_retreated_from():
+    answers = iter([Event.AGAIN, Event.RETREAT])
+    views = iter([Event.MEASURED, Event.UNSEEN, Event.UNSEEN, Event.MEASURED])
+
+    async def measured() -> Event:
+        return next(views, Event.MEASURED)
+
+    async def chosen() -> Event:
+        return next(answers)
+
+    parts = Everything(moves=1, MEASURE=measured, OFFER=chosen, PLAN_RETREAT=Event.PLANNED)
+    assert dock(parts) is State.DOCKED
+    walked = parts.states()
+    at = walked.index("blocked")
+    rest = ["blocked", "measure", "blocked", "retreat", "confirm-retreat", "move", "settle", "measure", "fit"]
+    assert walked[at : at + len(rest)] == rest
+    assert parts.began.count(Effect.MOVE) == 2
