@@ -159,6 +159,11 @@ class Motion(Protocol):
         """Run the loaded plan to its end, or to standstill after a stop or a fault."""
         ...
 
+    async def reset(self, role: str) -> None:
+        """Forget the fault that is held, on a person's order; then the axes have to be enabled again. Moves nothing.
+        Raises EventRefused with the reason, and what the devices answer."""
+        ...
+
     def request(self, verb: str) -> None:
         """`hold`, `resume` or `stop`, all on the path. Never waits; kept for the start when it comes before it."""
         ...
@@ -170,7 +175,7 @@ class Motion(Protocol):
         ...
 
     def feedback(self) -> Feedback:
-        """The newest read-back. Raises the fault that the motion side holds until the next `enable`."""
+        """The newest read-back. Raises the fault that the motion side holds until it is reset."""
         ...
 
     async def close(self) -> None: ...

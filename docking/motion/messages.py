@@ -6,7 +6,7 @@ One message is a header and a body, little-endian:
 
 The body is (kind, number, payload). Every value begins with one letter that says what follows: N none, T true, F false,
 i int64, d float64, s text, a array of float64, b array of bool, t sequence, m mapping, o noun (name, fields in their
-order), e member of an enumeration (its name, the member's), S states of axes, k kind of a fault, x error (class, where, cause, value,
+order), e member of an enumeration (its name, the member's), S states of axes, x error (class, where, cause, value,
 limit). The same bytes cross a socket in production and a queue in virtual time.
 """
 
@@ -125,12 +125,6 @@ def _put_mapping(value: dict[str, Any], out: list[bytes]) -> None:
         _put(item, out)
 
 
-def _put_kind(value: FaultKind, out: list[bytes]) -> None:
-    out.append(b"k")
-    raw = value.name.encode()
-    out.append(_U32.pack(len(raw)) + raw)
-
-
 def _put_noun(value: Any, out: list[bytes]) -> None:
     noun = type(value)
     out.append(b"o")
@@ -242,7 +236,6 @@ _READERS: Final[dict[bytes, Callable[[_Reader], Any]]] = {
     b"o": _Reader.noun,
     b"e": _Reader.member,
     b"S": lambda reader: _states_of(reader.raw()),
-    b"k": lambda reader: FaultKind[reader.text()],
     b"x": _Reader.error,
 }
 

@@ -86,6 +86,14 @@ class RemoteMotion:
             self._move = 0
             self._early.clear()
 
+    async def reset(self, role: str) -> None:
+        """Forget the fault that is kept, on a person's order; then the axes have to be enabled again.
+
+        Raises EventRefused with the reason, and what the devices answer.
+        """
+        await self._call("reset", role)
+        self._feedback = self._held = None
+
     def request(self, verb: str) -> None:
         if self._move:
             self._channel.send(encode("request", self._move, verb))

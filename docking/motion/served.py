@@ -23,7 +23,7 @@ LOOK_S = 0.01
 """How often the motion side is looked at: a fault reaches the cell this soon, ordinary read-backs come less often."""
 STOP_S = 30.0
 """Longest wait for a move to stop on its path before the wires are released without it."""
-CALLS = ("connect", "enable", "load", "start", "close")
+CALLS = ("connect", "enable", "load", "start", "reset", "close")
 
 
 class LocalMotion(Protocol):
@@ -38,6 +38,8 @@ class LocalMotion(Protocol):
     async def load(self, plan: Plan) -> None: ...
 
     async def start(self, plan_hash: str) -> MoveResult: ...
+
+    async def reset(self, role: str) -> None: ...
 
     def request(self, verb: str) -> None: ...
 
@@ -138,6 +140,10 @@ class ServedMotion:
             return await motion.load(payload)
         if kind == "start":
             return await motion.start(payload)
+        if kind == "reset":
+            await motion.reset(payload)
+            self._live = False
+            return None
         return await self._release()
 
     async def _connect(self) -> tuple[Identity, ...]:
