@@ -128,7 +128,7 @@ class StreamedMotion:
         self._setpoint = readonly(np.where(self._watch.driven, self._setpoint, plan.q_mm[0]))
         self._history.extend([self._setpoint] * 2)
         self._watch.watch_about(plan.q_mm[0], relief=plan.kind == "relief")
-        self._quick_stop_s = stop.t_stop_s + QUICK_STOP_S
+        self._quick_stop_s = stop.longest_s + QUICK_STOP_S
         self._loaded = Playback(plan, self._share), stop
 
     async def start(self, plan_hash: str) -> MoveResult:

@@ -13,13 +13,14 @@ class Sizes:
     """How much is measured; the defaults are the ones the targets are meant for."""
 
     repeats: int = 5
+    stop_instants: int = 10
     dock_cell: str = "fuselage-can"
     events_a_task: int = 2000
     study_seeds: int = 24
     study_repeats: int = 3
 
 
-TINY = Sizes(repeats=1, dock_cell="lab-can", events_a_task=20, study_seeds=2, study_repeats=1)
+TINY = Sizes(repeats=1, stop_instants=1, dock_cell="lab-can", events_a_task=20, study_seeds=2, study_repeats=1)
 """Enough to see that everything runs; the ratios mean nothing."""
 
 

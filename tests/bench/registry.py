@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from tests.bench import study, virtual_time
+from tests.bench import fault_reaction, stop_replan, stop_residual, study, virtual_time
 from tests.bench.metric import Group
 
 GROUPS: dict[str, Group] = {
+    "P4": stop_replan.measure,
+    "P9": fault_reaction.measure,
+    "P10": stop_residual.measure,
     "P11": virtual_time.measure,
     "P12": study.measure,
 }

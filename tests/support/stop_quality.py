@@ -12,6 +12,8 @@ from docking.config.cell import CellFile
 from docking.motion.playback import Playback
 from docking.motion.stops import PlannedStop, planned_stop
 from docking.planning import PlanRequest, make_plan
+from docking.planning.path import rigid_path
+from docking.planning.time_law import quintic
 from docking.types import Array, Correction, Plan
 from sim.virtual_time import run_virtual
 from tests.support.can_bench import Bench, can_cell, exchange
@@ -39,27 +41,27 @@ def site() -> Site:
 
 @cache
 def move(name: str) -> Plan:
-    """The plan of one of `MOVES`, on a grid of 10 ms."""
+    """The plan of one of `MOVES`, on a grid of 10 ms; where a duration is stated, by the quintic law in that time."""
     axis, turn_deg, shift, duration_s = MOVES[name]
     here = site()
     turn = np.radians(turn_deg) * axis / np.linalg.norm(axis)
-    speed, plan = 12.0, None
-    for _ in range(30):
-        request = PlanRequest(
-            plan_id=1,
-            stage="align",
-            kind="align",
-            q_now_mm=here.start_mm,
-            correction=Correction(here.pivot_mm, turn, shift),
-            speed_mm_s=speed,
-            period_s=CYCLE_S,
-            linear_interpolation=False,
-        )
-        plan = make_plan(request, here.positioners, here.settings)
-        if duration_s is None or abs(plan.duration_s - duration_s) <= 0.1:
-            return plan
-        speed *= plan.duration_s / duration_s
-    raise AssertionError(f"{name}: {plan.duration_s if plan else None} s")
+    request = PlanRequest(
+        plan_id=1,
+        stage="align",
+        kind="align",
+        q_now_mm=here.start_mm,
+        correction=Correction(here.pivot_mm, turn, shift),
+        speed_mm_s=12.0,
+        period_s=CYCLE_S,
+        linear_interpolation=False,
+    )
+    plan = make_plan(request, here.positioners, here.settings)
+    if duration_s is None:
+        return plan
+    t_s = CYCLE_S * np.arange(round(duration_s / CYCLE_S) + 1)
+    s = quintic(duration_s).at(t_s)
+    q_mm = rigid_path(here.positioners, here.start_mm, request.correction).axes_mm(s)
+    return replace(plan, t_s=t_s, s=s, q_mm=q_mm)
 
 
 def stop_of(plan: Plan, a_quick_mm_s2: float | None = None) -> PlannedStop:
