@@ -125,8 +125,22 @@ def _check_request(request: PlanRequest, positioners: Positioners) -> None:
     ):
         if not np.all(np.isfinite(array)):
             raise PlanInputInvalid(where, value=str(array), limit="finite")
+    if request.scene is not None:
+        _check_scene(request.scene)
     if not float(np.linalg.norm(correction.rotvec_rad)) <= np.pi:
         raise PlanInputInvalid("rotation", value=float(np.linalg.norm(correction.rotvec_rad)), limit="at most pi rad")
+
+
+def _check_scene(scene: Scene) -> None:
+    """Poses and stand-offs are numbers; only the station before the first is infinitely far."""
+    poses = np.concatenate([np.append(X.R.reshape(-1), X.t_mm) for X in (scene.X_WC, scene.X_WM, scene.X_WG)])
+    for where, value, good in (
+        ("measured poses", poses, np.all(np.isfinite(poses))),
+        ("stand-off", scene.standoff_mm, 0.0 <= scene.standoff_mm < float("inf")),
+        ("stand-off before", scene.from_standoff_mm, scene.from_standoff_mm >= 0.0),
+    ):
+        if not good:
+            raise PlanInputInvalid(where, value=str(value), limit="finite and not negative")
 
 
 def _content_hash(request: PlanRequest, axes: tuple[str, ...], s: Array, q_mm: Array) -> str:
