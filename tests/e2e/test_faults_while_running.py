@@ -13,6 +13,7 @@ from docking import cli
 from docking.assemble import runs
 from docking.errors import (
     AxisNotEnabled,
+    AxisStuck,
     BadReply,
     BallForceTrip,
     ConsistencyTrip,
@@ -108,7 +109,7 @@ def test_a_jammed_axis_stops_all_on_the_path(name, share, axis, tmp_path):
 
     run_: DryCell
     run = run_dry(name, 2, tmp_path, scenario)
-    coupling = (FollowingErrorTrip, ConsistencyTrip, InternalForceTrip, WarpTrip, DriveFault)
+    coupling = (AxisStuck, FollowingErrorTrip, ConsistencyTrip, InternalForceTrip, WarpTrip, DriveFault)
     assert_faulted(run, coupling, "")
     alarm = run.records("alarm")[0]
     assert jammed[0] in alarm["message"]

@@ -44,6 +44,7 @@ class Travel:
         self._axes, self._limits, self._timing, self._margins = positioners.axes, limits, timing, margins
         self._driven = np.asarray(positioners.driven, dtype=bool)
         self._free = ~self._driven
+        self._holds_force = np.flatnonzero(positioners.followers)
         self._unpowered = np.asarray(~positioners.powered, dtype=bool)
         self._any_free = bool(self._free.any())
         v_max = np.asarray(positioners.v_mm_s, dtype=np.float64)
@@ -103,6 +104,9 @@ class Travel:
         jump = self._jump(dt_s)
         if jump is not None:
             return jump
+        adrift = self._adrift(feedback.position_mm, q_ref_mm)
+        if adrift is not None:
+            return adrift
         if not moving:
             return self._stand(feedback, last[0])
         if not led:
@@ -117,6 +121,18 @@ class Travel:
             return None
         k = int(np.argmin(self._size <= dt_s))
         return self._disbelieve(k, float(self._step[k]), float(self._jump_mm_s[k]) * dt_s)
+
+    def _adrift(self, position_mm: Array, q_ref_mm: Array) -> Finding | None:
+        """An axis that holds a force goes where the component goes; anywhere else it has lost its ball and runs."""
+        if not len(self._holds_force):
+            return None
+        off, limit = (position_mm - q_ref_mm)[self._holds_force], self._limits.passive_mm
+        if self._margins.note("held_axis", float(np.abs(off).max()) / limit):
+            return None
+        k = int(np.argmin(np.abs(off) <= limit))
+        cause = "No set-point leads it: it holds a force."
+        error = AxisDrift(self._axes[self._holds_force[k]], cause, value=float(off[k]), limit=limit)
+        return Finding(Trigger.DRIFT, error)
 
     def _disbelieve(self, k: int, moved_mm: float, limit_mm: float, cause: str = "") -> Finding:
         return Finding(Trigger.ENCODER_JUMP, EncoderJump(self._axes[k], cause, value=moved_mm, limit=limit_mm))

@@ -59,6 +59,8 @@ class Watch:
         self._enabled: tuple[AxisState, ...] = ()
         self._late_in_a_row = 0
         self._clean: tuple[Feedback, Array] | None = None
+        self._complaint: tuple[str, int, str] | None = None
+        self._complaint_s = 0.0
         self.coupling = _NONE
         self.reset_maxima()
 
@@ -161,7 +163,7 @@ class Watch:
             )
             finding = found[0] or found[1] or found[2] or found[3] or found[4]
         finding = finding or self._told(feedback)
-        self._clean = (feedback, q_ref_mm) if finding is None else None
+        self._clean = (feedback, q_ref_mm) if finding is None and feedback.fault is None else None
         return finding
 
     def _unchanged(self, feedback: Feedback, q_ref_mm: Array) -> bool:
@@ -201,10 +203,15 @@ class Watch:
         """What devices warn of: limit switches, emergencies of drives that go on."""
         if feedback.at_limit is not None and feedback.at_limit.any():
             return Finding(Trigger.LIMIT_SWITCH, AxisAtLimit(self._axes[int(np.argmax(feedback.at_limit))]))
-        if feedback.fault is not None:
-            axis, code, text = feedback.fault
-            return Finding(Trigger.DRIVE_WARNING, DriveWarning(axis, text, value=code))
-        return None
+        if feedback.fault is None:
+            return None
+        if feedback.fault != self._complaint:
+            # An emergency overtakes the read-back that tells whether its drive goes on: the next one knows.
+            self._complaint, self._complaint_s = feedback.fault, feedback.t_s
+        if not (feedback.t_s > self._complaint_s):
+            return None
+        axis, code, text = feedback.fault
+        return Finding(Trigger.DRIVE_WARNING, DriveWarning(axis, text, value=code))
 
     def _judge_late(
         self, feedback: Feedback, q_ref_mm: Array, speed_mm_s: Array | float, moving: bool

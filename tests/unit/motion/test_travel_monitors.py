@@ -293,12 +293,36 @@ def test_a_limit_switch_is_told(row):
 
 @pytest.mark.parametrize("kind", list(FaultKind))
 def test_each_kind_of_fault_has_its_trigger(kind):
-    found = Bench().cycle(np.zeros(12), np.zeros(12), fault=("D.Y", 0x7305, "encoder"), fault_kind=kind)
+    bench, told = Bench(), {"fault": ("D.Y", 0x7305, "encoder"), "fault_kind": kind}
+    found = bench.cycle(np.zeros(12), np.zeros(12), **told)
+    if kind is FaultKind.DRIVE_WARNING:
+        # Only the next read-back tells that the drive goes on.
+        assert found is None
+        found = bench.cycle(np.zeros(12), np.zeros(12), **told)
     assert found is not None
     assert found.trigger.name == kind.name
     expected = DriveWarning if kind is FaultKind.DRIVE_WARNING else DriveFault
     assert isinstance(found.error, expected)
     assert (found.error.where, found.error.value, found.error.cause) == ("D.Y", 0x7305, "encoder")
+
+
+def test_an_emergency_of_a_drive_that_stops_is_no_warning():
+    bench = Bench()
+    fault = ("D.Y", 0x2310, "overcurrent")
+    assert bench.cycle(np.zeros(12), np.zeros(12), fault=fault, fault_kind=FaultKind.DRIVE_WARNING) is None
+    found = bench.cycle(np.zeros(12), np.zeros(12), fault=fault, fault_kind=FaultKind.DRIVE_FAULT)
+    assert found is not None
+    assert found.trigger is Trigger.DRIVE_FAULT
+
+
+def test_a_warning_at_rest_is_told_though_nothing_else_changes():
+    bench = Bench()
+    told = read_back(np.zeros(12), fault=("D.Y", 0x7305, "encoder"), fault_kind=FaultKind.DRIVE_WARNING)
+    at = np.zeros(12)
+    assert bench.watch.evaluate(told, at, 0.0, moving=False) is None
+    found = bench.watch.evaluate(replace(told, t_s=0.01), at, 0.0, moving=False)
+    assert found is not None
+    assert found.trigger is Trigger.DRIVE_WARNING
 
 
 def test_a_warning_hides_nothing_worse():
