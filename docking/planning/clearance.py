@@ -7,7 +7,8 @@ bound and value meet; an edge that is parallel to a face is decided at once.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from docking.types import Array
 
 _EXACT_MM = 0.005
 _HALVINGS = 40
+_STRIDE = 16
 
 Rows = NDArray[np.intp]
 
@@ -48,6 +50,43 @@ class Nearest:
     row: int
     edge: int
     box: int
+
+
+Places = Callable[[Rows], Array]
+"""Edges (p, e, 2, 3) at the given rows (p,) of a way."""
+
+
+def nearest_on_way(places: Places, boxes_mm: Array, asked_mm: Array, reach_mm: float) -> Nearest:
+    """The least distance less `asked_mm` (n,) over the n rows of a way; `row` counts them.
+
+    `reach_mm`: most that distance less asked can change from one row to the next. A few rows are looked at first; of
+    the others only those that could come below their best.
+    """
+    count = len(asked_mm)
+    few = np.unique(np.append(np.arange(0, count, _STRIDE), count - 1))
+    edges = places(few)
+    best = nearest(edges, boxes_mm, asked_mm[few])
+    least = least_bounds(edges, boxes_mm, asked_mm[few])
+    rows = np.arange(count)
+    left = few[np.searchsorted(few, rows, side="right") - 1]
+    right = few[np.minimum(np.searchsorted(few, rows), len(few) - 1)]
+    by_row = np.full(count, np.inf)
+    by_row[few] = least
+    bound = np.maximum(by_row[left] - reach_mm * (rows - left), by_row[right] - reach_mm * (right - rows))
+    open_ = np.flatnonzero((bound < best.excess_mm - _EXACT_MM) & ~np.isin(rows, few))
+    best = replace(best, row=int(few[best.row]))
+    if len(open_) == 0:
+        return best
+    found = nearest(places(open_), boxes_mm, asked_mm[open_])
+    return min(best, replace(found, row=int(open_[found.row])), key=lambda place: place.excess_mm)
+
+
+def least_bounds(ends_mm: Array, boxes_mm: Array, asked_mm: Array) -> Array:
+    """A lower bound of distance less asked for each pose (p,)."""
+    row, edge, box = (index.reshape(-1) for index in np.indices((len(ends_mm), ends_mm.shape[1], len(boxes_mm))))
+    _, bound = _piece(ends_mm[row, edge, 0], ends_mm[row, edge, 1], boxes_mm[box], asked_mm[row])
+    result: Array = bound.reshape(len(ends_mm), -1).min(axis=1)
+    return result
 
 
 def nearest(ends_mm: Array, boxes_mm: Array, asked_mm: Array) -> Nearest:

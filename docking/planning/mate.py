@@ -14,7 +14,7 @@ import numpy as np
 
 from docking.errors import ApproachRefused, MateTooNear
 from docking.geometry import exp_so3
-from docking.planning.clearance import Nearest, nearest
+from docking.planning.clearance import Nearest, Rows, nearest, nearest_on_way
 from docking.planning.path import CarriedPoints, carried_points
 from docking.planning.settings import MateSettings
 from docking.planning.time_law import TimeLaw
@@ -136,18 +136,40 @@ def _check_clearance(
 ) -> Clearance:
     """Clearance on the path, and where the drives could carry the part from it."""
     to_M = scene.X_WM.inverse()
-    on_path = edges.at(samples.s)
-    found = nearest(to_M.apply(on_path), mate.boxes_M_mm, _asked(samples.gap_mm, mate))
+    asked = _asked(samples.gap_mm, mate)
+    found = nearest_on_way(
+        lambda rows: to_M.apply(edges.at(samples.s[rows])), mate.boxes_M_mm, asked, _reach(edges, samples, asked)
+    )
     if not found.excess_mm >= 0.0:
-        _refuse_unless_leaving(found, to_M.apply(on_path), samples, mate)
+        _refuse_unless_leaving(found, to_M.apply(edges.at(samples.s)), samples, mate)
     if np.any(samples.carry > 0.0):
-        ahead = samples.carry[:, None, None, None] * edges.rate(samples.s)
-        closing = np.einsum("peji,i->pej", ahead, axis_W).mean(axis=(1, 2))
-        carried = nearest(to_M.apply(on_path + ahead), mate.boxes_M_mm, _asked(samples.gap_mm - closing, mate))
+        carried = _coasting(edges, samples, to_M, mate, axis_W)
         if not carried.excess_mm >= min(0.0, found.excess_mm):
-            _refuse_coasting(carried, to_M.apply(on_path), samples, mate)
+            _refuse_coasting(carried, to_M.apply(edges.at(samples.s)), samples, mate)
         found = min(found, carried, key=lambda place: place.excess_mm)
     return Clearance(found.distance_mm, found.distance_mm - found.excess_mm, float(samples.s[found.row]))
+
+
+def _coasting(edges: CarriedPoints, samples: _Samples, to_M: Pose, mate: MateSettings, axis_W: Array) -> Nearest:
+    """Where the drives could carry the part from every sample."""
+
+    def places(rows: Rows) -> Array:
+        s, carry = samples.s[rows], samples.carry[rows, None, None, None]
+        return to_M.apply(edges.at(s) + carry * edges.rate(s))
+
+    middle = CarriedPoints(edges.start_mm.mean(axis=(0, 1)), edges.rows.mean(axis=(1, 2)), edges.angle_rad)
+    closing = samples.carry * (middle.rate(samples.s) @ axis_W)
+    asked = _asked(samples.gap_mm - closing, mate)
+    return nearest_on_way(places, mate.boxes_M_mm, asked, _reach(edges, samples, asked))
+
+
+def _reach(edges: CarriedPoints, samples: _Samples, asked_mm: Array) -> float:
+    """Most that distance less asked changes between two samples: the way of the fastest point, coasting included."""
+    fastest = float(np.linalg.norm(edges.rows[0], axis=-1).max())
+    fastest += edges.angle_rad * float(np.linalg.norm(edges.rows[2], axis=-1).max())
+    step = float(np.diff(samples.s).max())
+    on = step * (1.0 + edges.angle_rad * float(samples.carry.max())) + float(np.abs(np.diff(samples.carry)).max())
+    return fastest * on + float(np.abs(np.diff(asked_mm)).max())
 
 
 def _asked(gap_mm: Array, mate: MateSettings) -> Array:
