@@ -1,4 +1,4 @@
-"""Faults while the enabled axes stand: named at once, nothing moves, nothing starts, whatever the operator asks next."""
+"""Faults while the enabled axes stand: named at once, nothing moves, nothing starts whatever is asked next."""
 
 from __future__ import annotations
 

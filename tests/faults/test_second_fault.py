@@ -1,4 +1,4 @@
-"""A second fault while the axes are being stopped for the first: the more severe reaction takes over, the cause stays."""
+"""A second fault while the axes stop for the first: the more severe reaction takes over, the first cause stays."""
 
 from __future__ import annotations
 
