@@ -237,7 +237,7 @@ class Procedure:
             return Event.MEASURE_MORE
         if verdict.action is Action.MOVE:
             correction = self._approach.correction(self._component_fit(), self._mate_fit(), station)
-            gap_mm = None if p.moves == 0 else station.standoff_mm
+            gap_mm = station.standoff_mm if p.way else None
             check_correction(correction, self._settings.guard, station.name, gap_mm)
             p.corrections, p.kind, p.stood_at = p.corrections + 1, "align", p.stage
             return Event.MOVE_NEEDED
