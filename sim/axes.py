@@ -122,12 +122,6 @@ class AxisBank:
             state[index] += by_mm
         self._flags = (b"", b"")
 
-    def displace(self, index: int, by_mm: float) -> None:
-        """Have one axis stand elsewhere, as a stop that was not straight has left it; its encoder says so."""
-        for state in (self.motor_mm, self._set, self._play):
-            state[index] += by_mm
-        self._flags = (b"", b"")
-
     def weaken(self, index: int, v_mm_s: float, a_mm_s2: float) -> None:
         """Let one axis reach no more than this speed and acceleration."""
         truth = self.truth

@@ -221,12 +221,6 @@ class Plant:
         self._encoder = None
         self._stale_steps += 1
 
-    def displace(self, axis: str, by_mm: float) -> None:
-        """Have a driven axis stand `by_mm` from where it stood: the part is left strained."""
-        self._bank.displace(self._driven(axis), by_mm)
-        self._encoder = None
-        self._stale_steps += 1
-
     def creep(self, axis: str, speed_mm_s: float) -> None:
         """Let a driven axis move whatever its servo and brake want: drift, slipping brake, runaway."""
         self._bank.seize(self._driven(axis), True, speed_mm_s)

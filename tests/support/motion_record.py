@@ -48,6 +48,7 @@ class RecordedPlant:
         self.following_error_mm = plant.following_error_mm
         self.at_rest = plant.at_rest
         self.force_n = plant.force_n
+        self.press = plant.press
 
     def step(self, t_s: float, target_mm: Array, powered: NDArray[np.bool_], braked: NDArray[np.bool_]) -> None:
         self.plant.step(t_s, target_mm, powered, braked)
