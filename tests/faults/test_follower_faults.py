@@ -1,0 +1,93 @@
+"""D.Z of `follower-force-can` holds its force through a move; jammed or without its ball it stops all axes."""
+
+from __future__ import annotations
+
+import asyncio
+
+import numpy as np
+import pytest
+
+from docking.errors import AxisDrift, AxisStuck, BallUnloaded, EncoderJump
+from docking.types import Array
+from tests.support.motion_record import AS_SENT_MM, along
+from tests.support.ready_cell import ReadyCell, Scene, play
+
+HELD_N, TOLERANCE_N = 13400.0, 268.0
+K = 11
+Watched = list[tuple[float, float, float, float]]
+
+
+def move(seed: int, fault: str | None = None) -> tuple[ReadyCell, Array]:
+    """One move, D.Z failing after 40 % of it; rows of time, force and position of D.Z, largest internal force."""
+    seen: Watched = []
+
+    def story(cell: ReadyCell) -> None:
+        plant, step = cell.plant, cell.recorded.step
+
+        def watched(t_s, *rest) -> None:
+            step(t_s, *rest)
+            if len(cell.recorded.ticks) % 4:
+                return
+            force, strain = float(plant.true_axis_forces_n()[K]), plant.true_internal_force_n()
+            seen.append((t_s, force, float(plant.encoder_mm()[K]), strain))
+
+        cell.recorded.step = watched  # type: ignore[method-assign]
+        if fault is not None:
+            cell.during(0.4, getattr(plant, fault), "D.Z")
+
+    cell = play(Scene("follower-force-can", seed=seed), story)
+    rows = np.array(seen)
+    return cell, rows[(rows[:, 0] >= cell.start_s) & (rows[:, 0] <= cell.ended_s)]
+
+
+def beside_the_path_mm(cell: ReadyCell) -> float:
+    """How far the set-points of the position-driven axes leave the planned path, at worst."""
+    times, targets = cell.record.set_points(cell.start_s)
+    return float(along(cell.plan, targets[times <= cell.ended_s], np.array(cell.cell.driven))[1].max())
+
+
+def test_it_keeps_its_force_through_a_move() -> None:
+    cell, rows = move(1)
+    assert cell.cause is None
+    # In the plant friction is 0.5 % of the force.
+    assert np.abs(rows[:, 1] - HELD_N).max() <= 0.005 * HELD_N + 1.0
+    trace = cell.result.trace  # type: ignore[union-attr]
+    assert np.abs(trace.force_n[:, K] - HELD_N).max() < TOLERANCE_N
+    travel = abs(float(cell.plan.displacement_mm[K]))
+    assert travel > 1.0
+    assert abs(rows[-1, 2] - rows[0, 2]) == pytest.approx(travel, abs=0.1)
+
+
+@pytest.mark.parametrize(("seed", "kind", "within_s"), [(2, AxisStuck, 0.1), (3, BallUnloaded, 0.3)])
+def test_jammed_it_stops_all_axes_on_the_path(seed: int, kind: type[Exception], within_s: float) -> None:
+    """At 3 mm/s its encoder tells within the window, at 0.6 mm/s the load cell does with its second reading."""
+    cell, rows = move(seed, "jam")
+    assert isinstance(cell.cause, kind), repr(cell.cause)
+    assert cell.cause.where == "D.Z"
+    assert cell.ended_s - cell.fault_s < within_s
+    assert rows[:, 3].max() < cell.cell.limits.internal_force_n
+    assert beside_the_path_mm(cell) < AS_SENT_MM
+
+
+def test_without_its_ball_in_a_move_it_stops_within_a_millimetre() -> None:
+    cell, rows = move(1, "lose_ball")
+    assert isinstance(cell.cause, EncoderJump | AxisStuck | AxisDrift), repr(cell.cause)
+    assert cell.cause.where == "D.Z"
+    before = rows[np.searchsorted(rows[:, 0], cell.fault_s) - 1, 2]
+    assert 0.1 < cell.plant.encoder_mm()[K] - before < 1.0
+
+
+def test_without_its_ball_at_standstill_it_is_braked() -> None:
+    def story(cell: ReadyCell):
+        async def lose() -> None:
+            before = cell.plant.encoder_mm()[K]
+            cell.plant.lose_ball("D.Z")
+            await asyncio.sleep(1.0)
+            drives = cell.group.drives
+            assert drives.braked[np.array(cell.cell.powered)].all()
+            assert not drives.powered.any()
+            assert 0.3 < cell.plant.encoder_mm()[K] - before < 1.5
+
+        return lose()
+
+    play(Scene("follower-force-can"), story)
