@@ -13,6 +13,7 @@ import numpy as np
 from docking.config.cell import CellFile, ModbusBus
 from docking.errors import (
     BadArgument,
+    DeviceRefused,
     DeviceSilent,
     DockingError,
     EnableFailed,
@@ -31,6 +32,7 @@ PREFILL_TRIES = 10
 LAG_CYCLES = 3
 MISSES = 2
 START_MM = 0.01
+BUSY = 6
 VERBS = ("run", "hold", "resume", "stop", "quick-stop", "reset")
 T = TypeVar("T")
 _MOVING = ("armed", "running", "held", "done", "enabled")
@@ -44,6 +46,11 @@ class _Watch:
         self._sent: deque[int] = deque(maxlen=LAG_CYCLES)
         self._alive = -1
         self._still = 0
+
+    @property
+    def age(self) -> int:
+        """Polls since this PLC last showed anything that is not old."""
+        return self.misses + self._still
 
     def complaint(self, sent: int, echo: int, alive: int) -> str:
         """Why the PLC or the link is not alive after this poll; empty when all is well."""
@@ -273,6 +280,12 @@ class ModbusPositioners:
                     plc.where, f"{watch.misses} replies lost in a row", limit=self._bus.timeout_s
                 ) from None
             return
+        except DeviceRefused as refusal:
+            # Busy: what was written may have been taken or not, so the next cycle only looks. Once.
+            watch.misses += 1
+            if refusal.value != BUSY or watch.misses >= MISSES:
+                raise
+            return
         head = plc.status.head
         complaint = watch.complaint(plc.heartbeat, head["hb_echo"], head["hb_plc"])
         if complaint:
@@ -321,7 +334,7 @@ class ModbusPositioners:
         words = np.array([axis for plc in self._plcs for axis in plc.status.axes], dtype=np.float64).T
         raw = words[:3] * self._units
         raw[2, words[2] == self._map.scale["no_force"]] = np.nan
-        heard = [plc for plc, watch in zip(self._plcs, self._watches, strict=True) if not watch.misses]
+        heard = [plc for plc, watch in zip(self._plcs, self._watches, strict=True) if not watch.age]
         times = [plc.path_time_s() for plc in heard or self._plcs]
         self.path_spread_s = max(times) - min(times)
         at_limit = (words[3].astype(np.int64) & self._map.flags["axis_limit"]) != 0
@@ -331,7 +344,7 @@ class ModbusPositioners:
             following_error_mm=raw[1],
             force_n=raw[2],
             states=self._states(),
-            age_cycles=np.repeat([float(watch.misses) for watch in self._watches], 3),
+            age_cycles=np.repeat([float(watch.age) for watch in self._watches], 3),
             path_time_s=min(times),
             fault=self._fault(),
             at_limit=at_limit if at_limit.any() else None,

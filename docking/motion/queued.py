@@ -119,7 +119,7 @@ class QueuedMotion:
         await self._next_cycle()
         self._refuse()
         self._require_enabled()
-        self._watch.watch_about(plan.q_mm[0])
+        self._watch.watch_about(plan.q_mm[0], relief=plan.kind == "relief")
         self._commanded = plan.q_mm[0]
         self._loaded = Playback(plan)
 
@@ -198,7 +198,7 @@ class QueuedMotion:
         return self._feedback
 
     async def close(self) -> None:
-        if self._move is not None:
+        if self._move is not None and self._keeping:
             self.request("stop")
             await asyncio.wait((self._move.done,))
         await self._end_keeper()
