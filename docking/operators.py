@@ -96,8 +96,8 @@ class TerminalOperator:
     def _take(self, word: str) -> None:
         if word in _ABORT:
             self._post(Event.ABORT)
-        elif _PERCENT.fullmatch(word) and float(word[:-1]) <= 100.0:
-            self._override(float(word[:-1]))
+        elif (speed := _PERCENT.fullmatch(word)) is not None and float(speed[1]) <= 100.0:
+            self._override(float(speed[1]))
         elif self._answer is not None and word in self._asked:
             self._answer.set_result(word)
             self._answer = None
@@ -195,4 +195,4 @@ _NO = frozenset({"n", "no", "否"})
 _AGAIN = frozenset({"m", "measure", "测量"})
 _RETREAT = frozenset({"r", "retreat", "退回"})
 _STEP = frozenset({"s", "step", "一步"})
-_PERCENT = re.compile(r"\d{1,3}(\.\d)?[%％]")
+_PERCENT = re.compile(r"(\d{1,3}(?:\.\d)?) ?[%％]")

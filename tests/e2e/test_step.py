@@ -188,3 +188,44 @@ def test_what_was_typed_ahead_confirms_nothing(cell: Path) -> None:
         terminal.type("a")
         assert terminal.ended() == 4, terminal.text
     assert not bodies(cell, "intent")
+
+
+def test_a_retreat_is_chosen_at_the_question_and_leads_back_to_a_measurement(cell: Path) -> None:
+    with step(cell) as terminal:
+        to_the_first_go(terminal)
+        assert "r = retreat" not in terminal.text, "there is no way back yet"
+        terminal.type("g")
+        terminal.see("moving: align")
+        terminal.type("150%")
+        terminal.see("emergency stop is hard-wired")
+        terminal.type("50%")
+        terminal.see("speed: 50 % of the plan")
+        grant(terminal, *stages(cell)[1].permissives)
+        terminal.see("r = retreat.*> \n")
+        terminal.type("r")
+        terminal.see("planned move 2: retreat")
+        grant(terminal, *stages(cell)[0].permissives)
+        terminal.see("g = .*> \n")
+        terminal.type("g")
+        terminal.see("moving: retreat")
+        terminal.see("measuring the component")
+        grant(terminal, *stages(cell)[0].permissives)
+        terminal.see("g = .*> \n")
+        terminal.type("a")
+        assert terminal.ended() == 4, terminal.text
+    plans = bodies(cell, "plan")
+    assert [p["kind"] for p in plans][-2:] == ["retreat", "align"]
+    forth, back = bodies(cell, "intent")
+    assert back["target_mm"] == pytest.approx(forth["start_mm"], abs=1e-3)
+    assert {"verb": "override", "percent": 50.0} in bodies(cell, "command")
+
+
+def test_a_part_without_strain_is_weighed_and_left_alone(cell: Path) -> None:
+    journal = cell.with_name("run.jsonl")
+    asked = ("relieve", str(cell), "--sim", "--supervisor", "A. Smith", "--journal", str(journal))
+    with Terminal(*asked, language="zh") as terminal:
+        assert terminal.ended() == 0, terminal.text
+    assert "应力已消除" in terminal.text
+    assert "绝对值" in terminal.text, "without a weighing before it has to say so"
+    assert not bodies(cell, "intent")
+    assert bodies(cell, "run_started")[0]["supervisor"] == "A. Smith"
