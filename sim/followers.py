@@ -27,6 +27,7 @@ class Followers:
         self._lost: dict[int, float] = {}
         self._shown: Array = np.full(len(mask), np.nan)
         self._speed: Array = np.zeros(len(mask))
+        self._still = False
         self._v_max: Array = np.zeros(len(mask))
         self._force_n: Array = np.zeros(len(mask))
         for index in np.flatnonzero(mask).tolist():
@@ -67,7 +68,9 @@ class Followers:
         return moved
 
     def motor_mm(self, target_mm: Array) -> Array:
-        """Set-points (m,) of the motors for set-points of the encoders."""
+        """Set-points (m,) of the motors for set-points of the encoders; an axis that presses heeds none."""
+        if self.pressing[self.mask].all():
+            return target_mm
         result: Array = np.where(self.mask, target_mm - self._equilibrium.slip_mm, target_mm)
         return result
 
@@ -79,8 +82,11 @@ class Followers:
 
     def note(self, encoder_mm: Array, dt_s: float) -> None:
         """Keep how fast the axes go, for one that shall hold its position the next moment."""
-        self._speed = np.nan_to_num(encoder_mm - self._shown) / dt_s
-        self._shown = encoder_mm
+        if encoder_mm is not self._shown:
+            self._speed = np.nan_to_num(encoder_mm - self._shown) / dt_s
+            self._shown, self._still = encoder_mm, False
+        elif not self._still:
+            self._speed, self._still = np.zeros(len(encoder_mm)), True
 
     def _hold(self) -> None:
         """Only what touches the component presses on it."""

@@ -59,7 +59,10 @@ class ForceTargets:
     def note(self, standing_mm: Array, elapsed_s: float) -> None:
         """Keep how fast the axes are taken along."""
         before, self._before_mm = self._before_mm, standing_mm
-        self.speed_mm_s = np.zeros_like(standing_mm) if before is None else (standing_mm - before) / elapsed_s
+        if standing_mm is not before:
+            self.speed_mm_s = np.zeros_like(standing_mm) if before is None else (standing_mm - before) / elapsed_s
+        elif self.speed_mm_s.any():
+            self.speed_mm_s = np.zeros_like(standing_mm)
 
     def exerted_n(self) -> Array:
         """Force of the axes that press (m,), NaN for all others; taken as passed on to the plant."""
