@@ -30,6 +30,7 @@ from docking.motion.lateness import Lateness
 from docking.motion.monitors import Watch
 from docking.motion.playback import Playback
 from docking.motion.recorder import Recorder
+from docking.motion.standstill import Standstill
 from docking.motion.stops import PlannedStop, planned_stop
 from docking.motion.triggers import Finding, Trigger
 from docking.ports import StreamedPositioners
@@ -42,12 +43,6 @@ STOP_CYCLES = 2
 QUICK_STOP_S = 0.1
 """By which a quick stop may outlast its ramp until all axes are seen at rest."""
 BRAKE_S = 2.0
-REST_MM = 0.002
-"""An axis that moves no more between two cycles stands..."""
-REST_CYCLES = 3
-"""...when it did so for these cycles, reporting at most..."""
-REST_AGE = 2
-"""...so many cycles late."""
 RESET_S = 0.3
 """How long nothing may be found again after what the nodes reported has been forgotten: three heartbeats."""
 
@@ -87,7 +82,7 @@ class StreamedMotion:
         self._applied = Reaction.NONE
         self._braking: asyncio.Task[None] | None = None
         self._braked = False
-        self._still = 0
+        self._standstill = Standstill()
         self._quick_stop_s = QUICK_STOP_S
         self._timer: asyncio.Handle | None = None
         self._deadline_s = self._skipped_s = 0.0
@@ -250,7 +245,7 @@ class StreamedMotion:
         except Exception as error:
             # No more set-points. Whoever waits for the move learns why, and so does everyone who asks later.
             move = self._move
-            self._raise(Trigger.DEFECT, _defect(error))
+            self._raise(Trigger.DEFECT, Defect("motion", f"{type(error).__name__}: {error}"))
             self._end()
             if move is not None and not move.done.done():
                 move.done.set_exception(error)
@@ -260,6 +255,9 @@ class StreamedMotion:
         now_s = asyncio.get_running_loop().time()
         late_s = now_s - self._deadline_s
         self.lateness.add(late_s)
+        # Missed deadlines are skipped, never made up for in a burst; the next is at least half a cycle away.
+        missed = max(0, math.floor(late_s / self._cycle_s + 0.5))
+        self._skipped_s += missed * self._cycle_s
         before, feedback = self._feedback, self._bus.latest()
         self._feedback = feedback
         applied = self._applied
@@ -273,9 +271,6 @@ class StreamedMotion:
         if self._applied is Reaction.HW:
             self._finish("fault")
             return
-        # Missed deadlines are skipped, never made up for in a burst; the next is at least half a cycle away.
-        missed = max(0, math.floor(late_s / self._cycle_s + 0.5))
-        self._skipped_s += missed * self._cycle_s
         self._deadline_s += (1 + missed) * self._cycle_s
         self._timer = asyncio.get_running_loop().call_at(self._deadline_s, self._tick)
 
@@ -349,7 +344,7 @@ class StreamedMotion:
             return self._quick_stop_s
         playback = self._move.playback
         led_s = playback.turn_s(0.0) if reaction is Reaction.PPS else playback.rate / self._move.stop.fast_slew_per_s
-        return led_s + (STOP_CYCLES + 1) * self._cycle_s
+        return led_s + STOP_CYCLES * self._cycle_s
 
     def _react(self, reaction: Reaction) -> None:
         """Begin the reaction in force, unless it has begun."""
@@ -359,7 +354,7 @@ class StreamedMotion:
         if reaction is Reaction.HW:
             self._bus.go_silent()
         elif reaction >= Reaction.SQS:
-            self._still = 0
+            self._standstill.begin()
             self._bus.quick_stop()
             if reaction is Reaction.SBT:
                 self._braked = False
@@ -382,10 +377,7 @@ class StreamedMotion:
         if self._applied is Reaction.SBT:
             return self._braked
         if self._applied is Reaction.SQS:
-            moved = np.inf if before is None else np.abs(feedback.position_mm - before.position_mm).max()
-            resting = moved <= REST_MM and feedback.age_cycles.max() <= REST_AGE
-            self._still = self._still + 1 if resting else 0
-            return self._still >= REST_CYCLES
+            return self._standstill.seen(before, feedback)
         return self._move is None or self._move.playback.standing or self._move.playback.at_end
 
     def _finish(self, outcome: str) -> None:
@@ -405,9 +397,3 @@ class StreamedMotion:
             self.arbiter.enter(Mode.STANDING)
         if move is not None:
             move.over.set()
-
-
-def _defect(error: Exception) -> DockingError:
-    defect = Defect("motion", f"{type(error).__name__}: {error}")
-    defect.__cause__ = error
-    return defect

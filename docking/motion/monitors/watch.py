@@ -23,7 +23,7 @@ from docking.motion.monitors.limits import Margins, Timing, WatchLimits
 from docking.motion.monitors.loads import BallLoads
 from docking.motion.monitors.travel import Travel
 from docking.motion.triggers import Finding, Trigger
-from docking.types import Array, AxisState, FaultKind, Feedback, Plan
+from docking.types import Array, AxisState, FaultKind, Feedback
 
 LATE_IN_A_ROW = 2
 """Cycles in a row that go without the figure because a read-back is late, however many may be missed by one axis."""
@@ -110,13 +110,6 @@ class Watch:
         self._travel.forget()
         self._loads.about(q_mm, relief=relief)
         self._clean = None
-
-    def quick_slew_per_s(self, plan: Plan) -> float:
-        """How fast a fault may turn the rate of `plan` down: with the path's own acceleration, inside the quick-stop
-        deceleration of every axis. Every cycle that a jammed axis is left behind strains the part."""
-        peak = np.abs(np.diff(plan.q_mm, axis=0)).max(axis=0) / plan.period_s
-        spare = (self._positioners.a_quick_mm_s2 - self._positioners.a_mm_s2) / np.maximum(peak, 1e-9)
-        return max(plan.rate_slew_per_s, float(np.min(spare[self.driven])))
 
     # the cycle ---------------------------------------------------------------------------------------------------
     def power(self, feedback: Feedback, *, may_stop: bool = False) -> MotionError | None:

@@ -19,7 +19,7 @@ from docking.errors import (
 from docking.types import AxisState
 from tests.reference_geometry import AXES, rc1
 from tests.support.motion_fakes import LIMITS, read_back, watch_of
-from tests.support.planned_moves import a_plan, lab_site
+from tests.support.planned_moves import lab_site
 from tests.support.rigid_figure import sockets_mm
 
 Q = np.zeros(12)
@@ -283,16 +283,3 @@ def test_the_figure_is_left_unjudged_for_two_cycles_in_a_row_at_most():
     watch = rc1_watch(replace(LIMITS, missing_cycles=20))
     behind = read_back(np.tile([-0.3, 0.1, 0.2], 4), age_cycles=np.ones(12))
     assert [judge(watch, behind, Q, 0.0) for _ in range(10)] == [None] * 10
-
-
-def test_a_fault_may_stop_a_plan_as_hard_as_the_axes_can():
-    plan = a_plan(lab_site(), 3)
-    positioners = lab_site().positioners
-    slew = watch_of(positioners).quick_slew_per_s(plan)
-    peak = np.abs(np.diff(plan.q_mm, axis=0)).max(axis=0) / plan.period_s
-    worst = (peak * slew + positioners.a_mm_s2) / positioners.a_quick_mm_s2
-    assert worst.max() == pytest.approx(1.0)
-    assert slew > 5.0 * plan.rate_slew_per_s
-    # Axes that can do no better than their path acceleration stop as a hold does.
-    weak = replace(positioners, a_quick_mm_s2=positioners.a_mm_s2)
-    assert watch_of(weak).quick_slew_per_s(plan) == plan.rate_slew_per_s
