@@ -376,6 +376,9 @@ def test_ax_08_a_seized_axis_costs_no_more_than_the_formula(
     assert residual_mm <= bound.residual_mm + cell.stated_mm()
     assert force_n <= bound.force_n
     assert bound.force_n <= 1.001 * cell.cell.limits.internal_force_n
-    assert cell.stood_s(axis) <= 0.2
+    # It is seen when it hangs back by stuck_mm, which takes a crawling axis its time.
+    row = int(share * cell.plan.duration_s / cell.plan.period_s)
+    there_mm_s = abs(cell.plan.q_mm[row + 1, cell.index(axis)] - cell.plan.q_mm[row, cell.index(axis)]) / 0.1
+    assert cell.stood_s(axis) <= 1.2 * cell.cell.limits.stuck_mm / there_mm_s + 0.1
     cell.assert_at_rest_and_braked()
     cell.assert_no_second_start()
