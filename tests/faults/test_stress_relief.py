@@ -7,10 +7,22 @@ import itertools
 import numpy as np
 import pytest
 
+from docking.assemble.relieving import tare_of
+from docking.assemble.runs import Files
+from docking.errors import BadArgument
+from docking.operators import AutomaticOperator
 from docking.state import Event, State
+from tests.support.dry_cell import DryCell, files, run_dry
 from tests.support.strained_cell import ReliefCase, Strained, relieved, warp_mm
 
 SEEDS = [1, *(pytest.param(seed, marks=pytest.mark.full) for seed in range(2, 13))]
+
+
+class Declining(AutomaticOperator):
+    """Says no to the first plan."""
+
+    async def confirm(self, plan, shown) -> Event:
+        return Event.DECLINED
 
 
 def assert_single_axes_moved_slowly(case: ReliefCase) -> None:
@@ -149,3 +161,24 @@ def test_a_part_that_touches_something_is_not_pulled_against_it(tared, push_n, t
     assert case.state is State.FAULT
     assert case.alarms()[0][0] == 2133
     assert not case.bodies("intent")
+
+
+def test_the_weighing_of_the_run_before_is_found_in_its_journal(tmp_path):
+    """A docking that the operator declines has weighed the part; the journal of another part has not."""
+    cell, job = files("lab-can")
+
+    def declined(run: DryCell) -> None:
+        run.controller.procedure.operator = Declining([].append)
+        run.journal.write("run_started", started)
+
+    started = {"part_number": job.part_number, "serial_number": job.serial_number, "axes": list(cell.axis_names)}
+    run = run_dry("lab-can", 1, tmp_path, declined)
+    assert run.plans == []
+    tare = tare_of(run.journal_path, Files(cell, job, tmp_path))
+    weight_n = 9.80665 * job.component.mass_kg
+    assert tare.weighing.force_n[2::3].sum() == pytest.approx(weight_n, rel=0.03)
+    assert tare.weighing.position_mm == pytest.approx(run.rest_mm, abs=0.02)
+    assert 0.0 <= tare.age_h < 0.1
+    other = job.model_copy(update={"serial_number": "another"})
+    with pytest.raises(BadArgument, match="no weighing of this part"):
+        tare_of(run.journal_path, Files(cell, other, tmp_path))
