@@ -238,7 +238,9 @@ def test_a_wrong_call_shows_the_usage_to_a_person(capsys: pytest.CaptureFixture[
 
 
 # files ---------------------------------------------------------------------------------------------------------------
-@pytest.mark.parametrize("command", [("check",), ("plan",), ("dry-run",), ("run", "--sim"), ("run", "--step"), ("study", "dock")])
+@pytest.mark.parametrize(
+    "command", [("check",), ("plan",), ("dry-run",), ("run", "--sim"), ("run", "--step"), ("study", "dock")]
+)
 def test_a_missing_cell_file_is_named(docking, command: tuple[str, ...]) -> None:
     error = docking(*command, "nowhere/cell.toml").error()
     assert (error["code"], error["where"]) == (4001, "nowhere/cell.toml")
