@@ -43,7 +43,7 @@ def _refuse_stroke(positioners: Positioners, settings: PlanSettings, k: int, s: 
     worst = int(np.argmax(np.where(np.isnan(over), np.inf, over)))
     first = int(np.argmax(~(over <= _ROUNDING)))
     value = float(q_mm[worst])
-    fits = f"{100.0 * s[first - 1]:.0f} % of the move fit" if first > 0 else "the start is outside already"
+    fits = f"{100.0 * s[first - 1]:.1f} % of the move fit" if first > 0 else "the start is outside already"
     cause = f"First outside at s = {s[first]:.3f}, worst at s = {s[worst]:.3f}; {fits}."
     raise StrokeExceeded(positioners.axes[k], cause, value=value, limit=float(low if value < low else high))
 

@@ -10,11 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from docking.errors import PlanStale, StrokeExceeded
+from docking.kinematics import Positioners
 from docking.planning import PlanRequest, make_plan, position_at, retreat_plan
 from docking.planning.path import rigid_path
 from docking.types import Array, Correction, Plan
 from tests.reference_geometry import GUARDED, crooked_axes, rc1, rc3
 from tests.support.rigid_figure import rigid_gap_mm, sockets_mm
+
+
+def wide(seed: int) -> Positioners:
+    """RC-1 with crooked axes and strokes that never bind."""
+    return replace(rc1(crooked_axes(seed)), stroke_mm=np.tile([-500.0, 500.0], (12, 1)))
 
 
 def executed(seed: int, queued: bool = False) -> Plan:
@@ -23,12 +29,12 @@ def executed(seed: int, queued: bool = False) -> Plan:
     asked = PlanRequest(
         seed, "align", "align", rng.uniform(-5, 5, 12), correction, 3.0, 0.1 if queued else 0.01, queued
     )
-    return make_plan(asked, rc1(crooked_axes(seed)), GUARDED)
+    return make_plan(asked, wide(seed), GUARDED)
 
 
 def off_the_path(plan: Plan, seed: int, rows: Array) -> float:
     """Largest distance of any row from the executed path, each at its nearest place on it."""
-    path = rigid_path(rc1(crooked_axes(seed)), plan.q_mm[0], plan.correction)
+    path = rigid_path(wide(seed), plan.q_mm[0], plan.correction)
     k = int(np.argmax(np.abs(plan.displacement_mm)))
     worst = 0.0
     for row in rows:
@@ -43,7 +49,7 @@ def off_the_path(plan: Plan, seed: int, rows: Array) -> float:
 @settings(deadline=None, max_examples=25)
 @given(st.integers(0, 10_000), st.floats(0.02, 1.0), st.booleans())
 def test_it_ends_where_the_move_began_and_never_leaves_its_path(seed: int, share: float, queued: bool) -> None:
-    plan, positioners = executed(seed, queued), rc1(crooked_axes(seed))
+    plan, positioners = executed(seed, queued), wide(seed)
     reached_s = share * plan.duration_s
     stood = position_at(plan, reached_s)
     back = retreat_plan([(plan, reached_s)], stood, positioners, GUARDED, 7)
@@ -91,7 +97,7 @@ def test_passive_axes_begin_where_they_are() -> None:
 
 def test_what_cannot_be_gone_back_is_refused() -> None:
     plan = executed(5)
-    positioners = rc1(crooked_axes(5))
+    positioners = wide(5)
     end = plan.q_mm[-1]
     moved = end + 0.03 * np.eye(12)[4]
     for way, stood in (
