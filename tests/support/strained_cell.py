@@ -90,7 +90,7 @@ class ReliefCase:
 
     def worst_rise(self) -> float:
         """Largest rise of any ball's true force over what it was as its step began, as a fraction of it."""
-        ends = [*self.step_starts[1:], len(self.ball_n)]
+        ends = [*self.step_starts[1:], len(self.ball_n)] if self.step_starts else []
         rises = [
             (np.max(self.ball_n[a:b], axis=0) / self.ball_n[a] - 1.0).max()
             for a, b in zip(self.step_starts, ends, strict=True)
