@@ -41,8 +41,9 @@ _MOVING = ("armed", "running", "held", "done", "enabled")
 class _Watch:
     """What the last polls of one PLC showed: lost replies and both heartbeats."""
 
-    def __init__(self) -> None:
+    def __init__(self, scan_s: float) -> None:
         self.misses = 0
+        self._scan_s, self._looked_s = scan_s, float("-inf")
         self._sent: deque[int] = deque(maxlen=LAG_CYCLES)
         self._alive = -1
         self._still = 0
@@ -52,12 +53,15 @@ class _Watch:
         """Polls since this PLC last showed anything that is not old."""
         return self.misses + self._still
 
-    def complaint(self, sent: int, echo: int, alive: int) -> str:
+    def complaint(self, sent: int, echo: int, alive: int, now_s: float) -> str:
         """Why the PLC or the link is not alive after this poll; empty when all is well."""
         oldest = self._sent[0] if len(self._sent) == LAG_CYCLES else echo
         self._sent.append(sent)
-        self._still = self._still + 1 if alive == self._alive else 0
-        self._alive = alive
+        if alive != self._alive:
+            self._still, self._alive, self._looked_s = 0, alive, now_s
+        elif now_s - self._looked_s >= 2.0 * self._scan_s:
+            # Two polls in one scan rightly show the same number.
+            self._still, self._looked_s = self._still + 1, now_s
         if (echo - oldest) & 0x8000:
             return f"the echo of the heartbeat lags more than {LAG_CYCLES} cycles"
         if self._still > LAG_CYCLES:
@@ -113,7 +117,7 @@ class ModbusPositioners:
         self._plcs = tuple(
             PositionerPlc(p, self._bus, self._map, self._addresses[p.name]) for p in self._cell.positioners
         )
-        self._watches = tuple(_Watch() for _ in self._plcs)
+        self._watches = tuple(_Watch(self._bus.scan_s) for _ in self._plcs)
         settings = self._settings()
         identities = tuple(await self._all(plc.bring_up(settings) for plc in self._plcs))
         for plc in self._plcs:
@@ -287,7 +291,7 @@ class ModbusPositioners:
                 raise
             return
         head = plc.status.head
-        complaint = watch.complaint(plc.heartbeat, head["hb_echo"], head["hb_plc"])
+        complaint = watch.complaint(plc.heartbeat, head["hb_echo"], head["hb_plc"], asyncio.get_running_loop().time())
         if complaint:
             raise LinkLost(plc.where, complaint)
 

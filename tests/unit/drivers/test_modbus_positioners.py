@@ -129,7 +129,7 @@ def test_a_whole_move_ends_on_the_last_row() -> None:
     play(scenario)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @example(2.0, "quick-stop", 0.05)
 @given(st.floats(0.05, 7.9), st.sampled_from(["hold", "stop", "quick-stop"]), st.floats(0.05, 0.9))
 def test_a_stop_at_any_moment_leaves_the_axes_on_the_path(at_s: float, verb: str, ramp_s: float) -> None:

@@ -16,6 +16,7 @@ def test_blocks_stand_where_the_plc_has_them() -> None:
         "heartbeat": (reg.HEARTBEAT_AT, 2),
         "segment": (reg.SEGMENT_AT, reg.SEGMENT_BYTES),
         "settings": (reg.SETTINGS_AT, reg.SETTINGS.size),
+        "motion": (reg.MOTION_AT, reg.MOTION.size),
         "status": (reg.STATUS_AT, reg.STATUS_HEAD.size + 3 * reg.STATUS_AXIS.size),
         "identity": (reg.IDENTITY_AT, reg.IDENTITY.size),
         "limits": (reg.LIMITS_AT, 3 * reg.LIMITS.size),
