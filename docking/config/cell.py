@@ -289,7 +289,7 @@ class MotionConfig(Model):
         default=0.5, description="the axes stop on the path when the cell process is silent this long, s"
     )
     feedback_s: Annotated[float, Field(ge=0.01, le=0.5)] = Field(
-        default=0.05, description="period of the read-backs that the cell process gets, s"
+        default=0.1, description="period of the read-backs that the cell process gets; faults come at once, s"
     )
     lateness_s: Annotated[float, Field(ge=0.1, le=60.0)] = Field(
         default=3.0, description="how long the motion process measures its own lateness before it connects, s"

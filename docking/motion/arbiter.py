@@ -60,6 +60,7 @@ class Arbiter:
         self.first: Finding | None = None
         self.later: tuple[Finding, ...] = ()
         self.rejected = 0
+        self.on_latched: Callable[[], None] = lambda: None
         self._allowed_s = allowed_s
         self._begun_s = self._limit_s = 0.0
         self._raised = False
@@ -138,6 +139,7 @@ class Arbiter:
         """Keep the first finding of each trigger."""
         if self.first is None:
             self.first = finding
+            self.on_latched()
         elif all(finding.trigger is not known.trigger for known in (self.first, *self.later)):
             self.later = (*self.later, finding)
 

@@ -12,6 +12,7 @@ limit). The same bytes cross a socket in production and a queue in virtual time.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
@@ -184,15 +185,18 @@ class _Reader:
     def text(self) -> str:
         return self.raw().decode()
 
-    def array(self, dtype: str) -> np.ndarray[Any, Any]:
-        dimensions = self._data[self.at]
-        shape = struct.unpack_from(f"<{dimensions}I", self._data, self.at + 1)
-        start = self.at + 1 + 4 * dimensions
-        count = int(np.prod(shape, dtype=np.int64))
-        value = np.frombuffer(self._data, dtype, count, start).reshape(shape).copy()
-        value.setflags(write=False)
-        self.at = start + value.nbytes
-        return value
+    def array(self, dtype: str, size: int) -> np.ndarray[Any, Any]:
+        """An array on a copy of its bytes: read-only, and the message need not live on."""
+        data, at = self._data, self.at + 1
+        dimensions = data[self.at]
+        shape = struct.unpack_from(f"<{dimensions}I", data, at)
+        at += 4 * dimensions
+        self.at = at + size * math.prod(shape)
+        raw = data[at : self.at]
+        if len(raw) != self.at - at:
+            raise ValueError("cut short")
+        value = np.frombuffer(raw, dtype)
+        return value if dimensions == 1 else value.reshape(shape)
 
     def sequence(self) -> tuple[Any, ...]:
         return tuple([self.take() for _ in range(self.number(_U32))])
@@ -229,8 +233,8 @@ _READERS: Final[dict[bytes, Callable[[_Reader], Any]]] = {
     b"i": lambda reader: reader.number(_I64),
     b"d": lambda reader: reader.number(_F64),
     b"s": _Reader.text,
-    b"a": lambda reader: reader.array("<f8"),
-    b"b": lambda reader: reader.array("?"),
+    b"a": lambda reader: reader.array("<f8", 8),
+    b"b": lambda reader: reader.array("?", 1),
     b"t": _Reader.sequence,
     b"m": _Reader.mapping,
     b"o": _Reader.noun,

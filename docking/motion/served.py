@@ -13,14 +13,13 @@ from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 from docking.errors import BadReply, DockingError, LeaseLost
+from docking.motion.arbiter import Arbiter
 from docking.motion.channel import Channel
 from docking.motion.lateness import Lateness, speed_limit_mm_s
 from docking.motion.messages import WHERE, decode, encode
 from docking.motion.triggers import Finding, Trigger
 from docking.types import Array, Feedback, Identity, MoveResult, Plan
 
-LOOK_S = 0.01
-"""How often the motion side is looked at: a fault reaches the cell this soon, ordinary read-backs come less often."""
 STOP_S = 30.0
 """Longest wait for a move to stop on its path before the wires are released without it."""
 CALLS = ("connect", "enable", "load", "start", "reset", "close")
@@ -30,6 +29,7 @@ class LocalMotion(Protocol):
     """What is served: a motion side that drives the positioners in this process, as `docking.ports.Motion` says."""
 
     axes: tuple[str, ...]
+    arbiter: Arbiter
 
     async def connect(self) -> tuple[Identity, ...]: ...
 
@@ -86,12 +86,13 @@ class ServedMotion:
         self._calls: dict[int, asyncio.Task[None]] = {}
         self._leaving: asyncio.Task[None] | None = None
         self._timer: asyncio.TimerHandle | None = None
-        self._renewed_s = self._due_s = self._loop.time()
+        self._renewed_s = self._loop.time()
         self._live = self._lapsed = False
         self._shown: Feedback | None = None
         self._told: DockingError | None = None
         self.ended = asyncio.Event()
         channel.on_message, channel.on_lost = self._take, self._lost
+        motion.arbiter.on_latched = self._latched
 
     # what comes in -------------------------------------------------------------------------------------------------
     def _take(self, message: bytes) -> None:
@@ -115,13 +116,13 @@ class ServedMotion:
         try:
             result = await self._perform(kind, payload)
         except DockingError as error:
-            self._publish(always=True)
+            self._publish()
             self._send("failed", number, error)
         except Exception as error:  # noqa: BLE001 - whatever went wrong is told to the cell, with the whole story
             self._send("said", 0, traceback.format_exc())
             self._send("failed", number, error)
         else:
-            self._publish(always=True)
+            self._publish()
             self._send("reply", number, result)
         finally:
             self._calls.pop(number, None)
@@ -164,35 +165,30 @@ class ServedMotion:
         self._channel.send(encode(kind, number, payload))
 
     def _look(self) -> None:
-        """Tell what is new, and see to the lease."""
+        """Tell how the axes stand, and see to the lease."""
         now_s = self._loop.time()
-        self._timer = self._loop.call_at(now_s + LOOK_S, self._look)
+        self._timer = self._loop.call_at(now_s + self._settings.feedback_s, self._look)
         silent_s = now_s - self._renewed_s
         if self._live and not (silent_s <= self._settings.lease_s):
             self._lapse(silent_s, "")
-        due = now_s >= self._due_s
-        if due:
-            self._due_s = now_s + self._settings.feedback_s - 0.5 * LOOK_S
-        self._publish(always=due)
+        self._publish()
 
-    def _publish(self, *, always: bool) -> None:
-        """Tell a fault and a change of state at once, other read-backs when it is time."""
+    def _latched(self) -> None:
+        """A fault is told at once, but not from within the tick that found it."""
+        self._loop.call_soon(self._publish)
+
+    def _publish(self) -> None:
+        """The newest read-back, or the fault that is kept."""
         if not self._live:
-            if always:
-                self._send("alive", 0, None)
+            self._send("alive", 0, None)
             return
         try:
             feedback = self._motion.feedback()
         except DockingError as error:
-            if error is not self._told:
-                self._send("held", 0, error)
-            elif always:
-                self._send("alive", 0, None)
+            self._send(*(("alive", 0, None) if error is self._told else ("held", 0, error)))
             self._told, self._shown = error, None
             return
         shown, self._told = self._shown, None
-        if not always and shown is not None and feedback.states is shown.states:
-            return
         if shown is not None and _unchanged(shown, feedback):
             self._send("still", 0, feedback.t_s)
             return

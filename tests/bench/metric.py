@@ -18,9 +18,12 @@ class Sizes:
     events_a_task: int = 2000
     study_seeds: int = 24
     study_repeats: int = 3
+    lateness_s: float = 60.0
 
 
-TINY = Sizes(repeats=1, stop_instants=1, dock_cell="lab-can", events_a_task=20, study_seeds=2, study_repeats=1)
+TINY = Sizes(
+    repeats=1, stop_instants=1, dock_cell="lab-can", events_a_task=20, study_seeds=2, study_repeats=1, lateness_s=0.3
+)
 """Enough to see that everything runs; the ratios mean nothing."""
 
 

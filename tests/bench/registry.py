@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from tests.bench import fault_reaction, planning, stop_replan, stop_residual, study, virtual_time
+from tests.bench import fault_reaction, planning, stop_replan, stop_residual, study, tick_lateness, virtual_time
 from tests.bench.metric import Group
 
 GROUPS: dict[str, Group] = {
     "P3": planning.measure,
     "P4": stop_replan.measure,
+    "P8": tick_lateness.measure,
     "P9": fault_reaction.measure,
     "P10": stop_residual.measure,
     "P11": virtual_time.measure,
