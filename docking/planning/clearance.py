@@ -65,8 +65,7 @@ def nearest_on_way(places: Places, boxes_mm: Array, asked_mm: Array, reach_mm: f
     count = len(asked_mm)
     few = np.unique(np.append(np.arange(0, count, _STRIDE), count - 1))
     edges = places(few)
-    best = nearest(edges, boxes_mm, asked_mm[few])
-    least = least_bounds(edges, boxes_mm, asked_mm[few])
+    best, least = _search(edges, boxes_mm, asked_mm[few])
     rows = np.arange(count)
     left = few[np.searchsorted(few, rows, side="right") - 1]
     right = few[np.minimum(np.searchsorted(few, rows), len(few) - 1)]
@@ -81,24 +80,23 @@ def nearest_on_way(places: Places, boxes_mm: Array, asked_mm: Array, reach_mm: f
     return min(best, replace(found, row=int(open_[found.row])), key=lambda place: place.excess_mm)
 
 
-def least_bounds(ends_mm: Array, boxes_mm: Array, asked_mm: Array) -> Array:
-    """A lower bound of distance less asked for each pose (p,)."""
-    row, edge, box = (index.reshape(-1) for index in np.indices((len(ends_mm), ends_mm.shape[1], len(boxes_mm))))
-    _, bound = _piece(ends_mm[row, edge, 0], ends_mm[row, edge, 1], boxes_mm[box], asked_mm[row])
-    result: Array = bound.reshape(len(ends_mm), -1).min(axis=1)
-    return result
-
-
 def nearest(ends_mm: Array, boxes_mm: Array, asked_mm: Array) -> Nearest:
     """Search edges `ends_mm` (p, e, 2, 3) at p poses, against `boxes_mm` (b, 2, 3), for the least distance less
     `asked_mm` (p,). Needs at least one pose, edge and box."""
+    return _search(ends_mm, boxes_mm, asked_mm)[0]
+
+
+def _search(ends_mm: Array, boxes_mm: Array, asked_mm: Array) -> tuple[Nearest, Array]:
+    """The nearest, and a lower bound of distance less asked for each pose (p,)."""
     shape = (len(ends_mm), ends_mm.shape[1], len(boxes_mm))
     row, edge, box = (index.reshape(-1) for index in np.indices(shape))
     start, end = ends_mm[row, edge, 0], ends_mm[row, edge, 1]
     best: Nearest | None = None
+    least = np.zeros(len(ends_mm))
     for _ in range(_HALVINGS):
         value, bound = _piece(start, end, boxes_mm[box], asked_mm[row])
         i = int(np.argmin(value))
+        least = least if best is not None else bound.reshape(shape[0], -1).min(axis=1)
         if best is None or value[i] < best.excess_mm:
             best = Nearest(float(value[i]), float(value[i] + asked_mm[row[i]]), int(row[i]), int(edge[i]), int(box[i]))
         open_ = np.flatnonzero(bound < best.excess_mm - _EXACT_MM)
@@ -108,7 +106,7 @@ def nearest(ends_mm: Array, boxes_mm: Array, asked_mm: Array) -> Nearest:
         start, end = np.concatenate([start[open_], middle]), np.concatenate([middle, end[open_]])
         row, edge, box = (np.tile(index[open_], 2) for index in (row, edge, box))
     assert best is not None
-    return best
+    return best, least
 
 
 def _piece(start: Array, end: Array, boxes: Array, asked: Array) -> tuple[Array, Array]:

@@ -27,10 +27,9 @@ def check_strokes(path: RigidPath, positioners: Positioners, settings: PlanSetti
     s = np.linspace(0.0, 1.0, ceil(path.travel_mm / settings.sample_mm) + 2)
     q = path.axes_mm(s)
     low, high = positioners.stroke_mm.T
-    room = np.minimum(q - low, high - q)
-    least: Array = room.min(axis=0)
+    least: Array = np.minimum(q.min(axis=0) - low, high - q.max(axis=0))
     for k in np.flatnonzero(~(least >= settings.stroke_margin_mm - _ROUNDING)):
-        lacking = settings.stroke_margin_mm - room[:, k]
+        lacking = settings.stroke_margin_mm - np.minimum(q[:, k] - low[k], high[k] - q[:, k])
         shrinking = bool(np.all(np.diff(np.maximum(lacking, 0.0)) <= 1e-9)) and lacking[-1] < lacking[0]
         if not (lacking[0] > _ROUNDING and shrinking):
             _refuse_stroke(positioners, settings, int(k), s, q[:, k])
