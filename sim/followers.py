@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,8 +28,8 @@ class Followers:
         self._jammed: set[int] = set()
         self._lost: dict[int, float] = {}
         self._shown: Array = np.full(len(mask), np.nan)
-        self._speed: Array = np.zeros(len(mask))
-        self._still = False
+        self._before, self._dt_s = self._shown, 1.0
+        self._all_press = False
         self._v_max: Array = np.zeros(len(mask))
         self._force_n: Array = np.zeros(len(mask))
         for index in np.flatnonzero(mask).tolist():
@@ -37,14 +39,14 @@ class Followers:
         """From now on these forces (m,); an axis without one (NaN) holds the position that it has, going on as fast as
         it went. `v_max_mm_s` (m,) is how fast an axis may become that meets no resistance."""
         before, self.pressing = self.pressing, np.isfinite(force_n) & self.mask
-        self._v_max = v_max_mm_s
+        self._v_max, self._all_press = v_max_mm_s, bool(self.pressing[self.mask].all())
         self._force_n = np.where(self.pressing, np.nan_to_num(force_n), 0.0)
         self._hold()
         self._bank.let_go(self.pressing)
         for index in np.flatnonzero(self.mask).tolist():
             self._relock(index)
             if before[index] and not self.pressing[index]:
-                self._bank.take_up(index, float(self._speed[index]))
+                self._bank.take_up(index, self._speed(index))
 
     def jam(self, index: int, jammed: bool) -> None:
         """Seize or free one of them mechanically."""
@@ -69,7 +71,7 @@ class Followers:
 
     def motor_mm(self, target_mm: Array) -> Array:
         """Set-points (m,) of the motors for set-points of the encoders; an axis that presses heeds none."""
-        if self.pressing[self.mask].all():
+        if self._all_press:
             return target_mm
         result: Array = np.where(self.mask, target_mm - self._equilibrium.slip_mm, target_mm)
         return result
@@ -82,11 +84,11 @@ class Followers:
 
     def note(self, encoder_mm: Array, dt_s: float) -> None:
         """Keep how fast the axes go, for one that shall hold its position the next moment."""
-        if encoder_mm is not self._shown:
-            self._speed = np.nan_to_num(encoder_mm - self._shown) / dt_s
-            self._shown, self._still = encoder_mm, False
-        elif not self._still:
-            self._speed, self._still = np.zeros(len(encoder_mm)), True
+        self._before, self._shown, self._dt_s = self._shown, encoder_mm, dt_s
+
+    def _speed(self, index: int) -> float:
+        speed = float(self._shown[index] - self._before[index]) / self._dt_s
+        return 0.0 if math.isnan(speed) else speed
 
     def _hold(self) -> None:
         """Only what touches the component presses on it."""

@@ -216,7 +216,7 @@ class Drives:
     def _begin_ramp(self, index: int, stage: Stage, t_s: float) -> None:
         if self.stages[index] is Stage.OPERATION:
             speed = (self._goal[index] - self._start[index]) / self.cycle_s
-            own = float(self.forces.speed_mm_s[index]) if self.forces.pressing[index] else 0.0
+            own = self.forces.speed_mm_s(index) if self.forces.pressing[index] else 0.0
             self._speed[index] = speed if self.following[index] else own
         self._enter(index, stage, t_s)
 

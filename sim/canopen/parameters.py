@@ -30,11 +30,12 @@ class ForceTargets:
 
     def __init__(self, count: int, limits: Parameters) -> None:
         self.pressing: BoolArray = np.zeros(count, np.bool_)
-        self.speed_mm_s: Array = np.zeros(count)
         self.changed = False
         self._limits = limits
         self._target_n: Array = np.zeros(count)
         self._before_mm: Array | None = None
+        self._here_mm: Array | None = None
+        self._elapsed_s = 1.0
 
     def aim(self, index: int, force_n: float) -> None:
         """Target force of one axis, cut to what the drive was permitted."""
@@ -46,7 +47,7 @@ class ForceTargets:
     def take(self, index: int) -> None:
         """One axis begins to exert its target force."""
         self.pressing[index] = self.changed = True
-        self._before_mm = None
+        self._before_mm = self._here_mm = None
 
     def release(self, index: int) -> bool:
         """One axis ceases to; False when it did not press."""
@@ -57,12 +58,14 @@ class ForceTargets:
         return True
 
     def note(self, standing_mm: Array, elapsed_s: float) -> None:
-        """Keep how fast the axes are taken along."""
-        before, self._before_mm = self._before_mm, standing_mm
-        if standing_mm is not before:
-            self.speed_mm_s = np.zeros_like(standing_mm) if before is None else (standing_mm - before) / elapsed_s
-        elif self.speed_mm_s.any():
-            self.speed_mm_s = np.zeros_like(standing_mm)
+        """Keep where the axes are taken."""
+        self._before_mm, self._here_mm, self._elapsed_s = self._here_mm, standing_mm, elapsed_s
+
+    def speed_mm_s(self, index: int) -> float:
+        """How fast one axis is taken along."""
+        if self._before_mm is None or self._here_mm is None:
+            return 0.0
+        return float(self._here_mm[index] - self._before_mm[index]) / self._elapsed_s
 
     def exerted_n(self) -> Array:
         """Force of the axes that press (m,), NaN for all others; taken as passed on to the plant."""
