@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import os
 import sys
@@ -25,6 +24,7 @@ from docking.errors import (
     DockingError,
     StoppedByOperator,
 )
+from docking.terminal import FILE, json_option, language, print_json, print_text
 from docking.words import tell
 
 EXIT_OF_OUTCOME = {
@@ -35,33 +35,8 @@ EXIT_OF_OUTCOME = {
     "fault": EXIT_FAULT,
     "refused": EXIT_FAULT,
 }
-FILE = click.Path(path_type=Path)
 SEED = click.IntRange(min=0)
 COUNT = click.IntRange(min=1)
-
-
-def language() -> str:
-    """`zh` when DOCKING_LANGUAGE (or the locale) asks for it, else `en`."""
-    asked = os.environ.get("DOCKING_LANGUAGE") or os.environ.get("LC_ALL") or os.environ.get("LANG") or "en"
-    return "zh" if asked.lower().startswith("zh") else "en"
-
-
-def _json_option(command: Callable[..., Any]) -> Callable[..., Any]:
-    return click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout and nothing else.")(
-        command
-    )
-
-
-def _print(text: str, *, err: bool = False) -> None:
-    """Print; a terminal that has gone away changes neither what the cell does nor the exit code."""
-    with contextlib.suppress(OSError):
-        click.echo(text, err=err)
-
-
-def _print_json(body: dict[str, Any]) -> None:
-    from docking.journal import canonical
-
-    _print(canonical(body))
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -79,7 +54,7 @@ def cli() -> None:
 @cli.command()
 @click.argument("cell", type=FILE)
 @click.argument("job", type=FILE, required=False)
-@_json_option
+@json_option
 def check(cell: Path, job: Path | None, as_json: bool) -> int:
     """Check a CELL file and its JOB file, and say what the cell can prove.
 
@@ -90,7 +65,7 @@ def check(cell: Path, job: Path | None, as_json: bool) -> int:
 
     result = check_files(cell, job)
     if as_json:
-        _print_json(result.as_json())
+        print_json(result.as_json())
     else:
         click.echo(result.text)
     return EXIT_OK
@@ -104,7 +79,7 @@ def check(cell: Path, job: Path | None, as_json: bool) -> int:
 )
 @click.option("--seed", type=SEED, help="Draw the start inside the guard of the first correction instead.")
 @click.option("--plot", type=FILE, help="Draw every axis along the paths into this HTML file.")
-@_json_option
+@json_option
 def plan(cell: Path, job: Path | None, start: str | None, seed: int | None, plot: Path | None, as_json: bool) -> int:
     """Plan and check every move of a job without connecting or moving anything.
 
@@ -119,17 +94,17 @@ def plan(cell: Path, job: Path | None, start: str | None, seed: int | None, plot
     preview = open_preview(cell, job, start, seed)
     moves = []
     if not as_json:
-        _print(head_text(preview))
+        print_text(head_text(preview))
     for move in preview.moves():
         moves.append((move, move_text(move)))
         if not as_json:
-            _print(moves[-1][1])
+            print_text(moves[-1][1])
     if plot is not None:
         from docking.report.plan_page import write_plan_page
 
         write_plan_page(f"Plan of {preview.cell.name}", head_text(preview), moves, plot)
     if as_json:
-        _print_json(preview_json(preview, [move for move, _ in moves]))
+        print_json(preview_json(preview, [move for move, _ in moves]))
     return EXIT_OK
 
 
@@ -141,7 +116,7 @@ def plan(cell: Path, job: Path | None, start: str | None, seed: int | None, plot
 @click.option(
     "--journal", type=FILE, help="Keep the journal in this file (default: beside the report, else temporary)."
 )
-@_json_option
+@json_option
 def dry_run(cell: Path, job: Path | None, seed: int, report: Path | None, journal: Path | None, as_json: bool) -> int:
     """Dock against simulated devices in virtual time: real state machine, real drivers, real bytes.
 
@@ -166,7 +141,7 @@ def dry_run(cell: Path, job: Path | None, seed: int, report: Path | None, journa
 @click.option(
     "--journal", type=FILE, help="Keep the journal in this file (default: beside the report, else temporary)."
 )
-@_json_option
+@json_option
 def run(as_json: bool, step: bool, sim: bool, wires: Path | None, **request: Any) -> int:
     """Dock over real wires, to real devices or (--sim) simulated ones.
 
@@ -195,7 +170,7 @@ def run(as_json: bool, step: bool, sim: bool, wires: Path | None, **request: Any
 @click.option("--wires", type=FILE, help="Addresses that `docking sim` wrote; without it --sim starts its own devices.")
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Seed of the simulated errors (with --sim).")
 @click.option("--journal", type=FILE, help="Keep the journal in this file (default: temporary).")
-@_json_option
+@json_option
 def relieve(as_json: bool, supervisor: str, after: Path | None, sim: bool, wires: Path | None, **request: Any) -> int:
     """Take the strain out of a part that a stop or fault has left on the balls, by small steps of single axes.
 
@@ -213,11 +188,11 @@ def relieve(as_json: bool, supervisor: str, after: Path | None, sim: bool, wires
     wanted = assemble.ReliefRequest(run, supervisor.strip(), after)
     summary = assemble.relieve(wanted, assemble.WireChoice(sim, wires), _say(as_json))
     if as_json:
-        _print_json(summary)
+        print_json(summary)
     else:
-        _print(tell(language(), summary["outcome"]))
+        print_text(tell(language(), summary["outcome"]))
         if summary["internal_force_n"] is not None:
-            _print(tell(language(), "relief", **summary))
+            print_text(tell(language(), "relief", **summary))
     return EXIT_OF_OUTCOME[summary["outcome"]]
 
 
@@ -245,7 +220,7 @@ def sim(cell: Path, job: Path | None, seed: int, wires: Path | None, trace: Path
 @click.option(
     "--method", type=click.Choice(["svd", "three-point", "least-squares"]), default="least-squares", show_default=True
 )
-@_json_option
+@json_option
 def fit(nominal: Path, measured: Path, method: str, as_json: bool) -> int:
     """Fit the pose that takes NOMINAL points into MEASURED coordinates (CSV files).
 
@@ -257,7 +232,7 @@ def fit(nominal: Path, measured: Path, method: str, as_json: bool) -> int:
 
     result = fit_files(nominal, measured, method)
     if as_json:
-        _print_json(result)
+        print_json(result)
     else:
         click.echo(fit_text(result))
     return EXIT_FAULT if result["refused"] else EXIT_OK
@@ -284,7 +259,7 @@ def study() -> None:
 )
 @click.option("--tolerance-mm", type=float, help="With --stress: the tolerance of every feature.")
 @click.option("--error", "errors", multiple=True, help="NAME=SCALE of one unmodelled error; others stay as they are.")
-@_json_option
+@json_option
 def study_dock(cells: tuple[Path, ...], as_json: bool, **options: Any) -> int:
     """Dock every reference cell (or CELLS) with many seeds and count the outcomes.
 
@@ -295,7 +270,7 @@ def study_dock(cells: tuple[Path, ...], as_json: bool, **options: Any) -> int:
 
     result = study_dock(StudyRequest(cells=cells, **options), _say(as_json))
     if as_json:
-        _print_json(result)
+        print_json(result)
     else:
         click.echo(study_text(result))
     return EXIT_OK
@@ -303,14 +278,14 @@ def study_dock(cells: tuple[Path, ...], as_json: bool, **options: Any) -> int:
 
 def _say(as_json: bool) -> Callable[[str], None]:
     """Where progress goes: stdout for a person, stderr when stdout carries JSON."""
-    return lambda text: _print(text, err=as_json)
+    return lambda text: print_text(text, err=as_json)
 
 
 def _ended(summary: dict[str, Any], as_json: bool) -> int:
     if as_json:
-        _print_json(summary)
+        print_json(summary)
     else:
-        _print(_summary_text(summary))
+        print_text(_summary_text(summary))
     return EXIT_OF_OUTCOME[summary["outcome"]]
 
 
@@ -340,9 +315,9 @@ def _error_json(error: DockingError) -> dict[str, Any]:
 
 def _fail(error: DockingError, as_json: bool) -> int:
     if as_json:
-        _print_json(_error_json(error))
+        print_json(_error_json(error))
     else:
-        _print(f"{error.code}: {error.text(language())}\n    -> {error.remedy(language())}", err=True)
+        print_text(f"{error.code}: {error.text(language())}\n    -> {error.remedy(language())}", err=True)
     return error.exit_code
 
 
@@ -355,7 +330,7 @@ def call(arguments: list[str]) -> int:
     except click.UsageError as error:
         where = error.ctx.command_path if error.ctx else "docking"
         if not as_json and error.ctx:
-            _print(error.ctx.get_usage(), err=True)
+            print_text(error.ctx.get_usage(), err=True)
         return _fail(BadArgument(where, error.format_message(), value=" ".join(arguments)), as_json)
     except DockingError as error:
         return _fail(error, as_json)
