@@ -274,6 +274,14 @@ class SigmaMissing(PoseError):
     code = 3012
 
 
+class ComponentDeformed(PoseError):
+    code = 3014
+
+
+class NoRedundancy(NotCongruent):
+    code = 3015
+
+
 # 4xxx files and arguments ----------------------------------------------------------------------------------------
 class ConfigError(DockingError):
     """Files and arguments."""
