@@ -14,6 +14,7 @@ from docking.config.cell import CellFile
 from docking.config.job import Component, JobFile, Mate
 from docking.config.nominal import feature_points, mate_feature_points, target_points
 from docking.geometry import pose_from_vector
+from docking.pose.expected import Layout
 from docking.pose.features import specific_risk
 from docking.pose.layout import spread
 from docking.pose.least_squares import design, weighted_centroid
@@ -107,41 +108,58 @@ def _joint_covs(cell: CellFile, job: JobFile, passes: int) -> tuple[Array, ...]:
     features = feature_points(job.component, cell)
     mates = mate_feature_points(job.component, job.mate, cell)
     at_W = X_WC.apply(features.xyz_mm)
-    component = _part_covs(_Readings.of(cell, job.component, X_WC, passes), at_W)
-    mate = _part_covs(_Readings.of(cell, job.mate, X_WM, passes), at_W)
-    drift_mm = cell.tracker.drift_um_per_h * 1e-3 * cell.limits.fit_age_s / 3600.0
-    count = len(at_W)
+    component = _part_covs(PartReadings.of(cell, job.component, X_WC, passes), at_W)
+    mate = _part_covs(PartReadings.of(cell, job.mate, X_WM, passes), at_W)
     return (
         component[0],
         mate[0],
         component[1],
         mate[1],
         linalg.block_diag(*(features.cov_mm2 + mates.cov_mm2)),
-        drift_mm**2 * np.tile(np.eye(3), (count, count)),
+        drift_cov_mm2(cell, len(at_W)),
         component[2] + mate[2],
     )
 
 
+def drift_cov_mm2(cell: CellFile, count: int) -> Array:
+    """Joint covariance (3f, 3f) of `count` features by the station's drift over the age that a fit may have."""
+    drift_mm = cell.tracker.drift_um_per_h * 1e-3 * cell.limits.fit_age_s / 3600.0
+    result: Array = drift_mm**2 * np.tile(np.eye(3), (count, count))
+    return result
+
+
+def reading_cov_mm2(cell: CellFile, at_W_mm: Array, passes: int) -> Array:
+    """Covariance (n, 3, 3) in W of readings of points (n, 3) from the cell's station, `passes` of them averaged."""
+    X_TW = pose_from_vector(cell.tracker.station_pose).inverse()
+    result: Array = X_TW.R.T @ noise_of(cell).covariance(X_TW.apply(at_W_mm)) @ X_TW.R / passes
+    return result
+
+
 @dataclass(frozen=True, eq=False)
-class _Readings:
+class PartReadings:
     """What a fit of one part rests on, in W: points (n, 3), covariances (n, 3, 3) of the averaged readings and of the
     nominal nests, and the sigma of the part's relative expansion."""
 
+    names: tuple[str, ...]
     xyz_mm: Array
     noise_mm2: Array
     nominal_mm2: Array
     expansion: float
 
     @classmethod
-    def of(cls, cell: CellFile, part: Component | Mate, X_WN: Pose, passes: int) -> _Readings:
+    def of(cls, cell: CellFile, part: Component | Mate, X_WN: Pose, passes: int) -> PartReadings:
         targets = target_points(part.targets, part, cell)
-        at_W, X_TW = X_WN.apply(targets.xyz_mm), pose_from_vector(cell.tracker.station_pose).inverse()
-        noise = X_TW.R.T @ noise_of(cell).covariance(X_TW.apply(at_W)) @ X_TW.R / passes
+        at_W = X_WN.apply(targets.xyz_mm)
+        noise = reading_cov_mm2(cell, at_W, passes)
         nominal = X_WN.R @ targets.cov_mm2 @ X_WN.R.T
-        return cls(at_W, noise, nominal, part.expansion_per_k * part.temperature_sigma_k)
+        return cls(targets.names, at_W, noise, nominal, part.expansion_per_k * part.temperature_sigma_k)
+
+    def layout(self) -> Layout:
+        """The same as a layout whose fit can be foreseen."""
+        return Layout(self.names, self.xyz_mm, self.noise_mm2 + self.nominal_mm2, self.expansion)
 
 
-def _part_covs(readings: _Readings, features_W_mm: Array) -> tuple[Array, Array, Array]:
+def _part_covs(readings: PartReadings, features_W_mm: Array) -> tuple[Array, Array, Array]:
     """Joint covariances (3f, 3f) that the fit of one part gives the features: by noise, nominal nests, temperature.
 
     The weighted fit [rotation, translation, expansion] has the gain G = P A^T S^-1, P = (A^T S^-1 A + L)^-1, with the

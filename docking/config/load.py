@@ -29,9 +29,12 @@ def load_cell(path: Path | str) -> CellFile:
     return _load(Path(path), CellFile, cell_document_findings, check_cell)
 
 
-def load_job(path: Path | str, cell: CellFile) -> JobFile:
-    """The job of a JOB file, checked against its cell. Raises FileUnreadable, ConfigInvalid."""
-    return _load(Path(path), JobFile, job_document_findings, lambda job: check_job(cell, job))
+def load_job(path: Path | str, cell: CellFile, *, proof: bool = True) -> JobFile:
+    """The job of a JOB file, checked against its cell; without `proof` its tolerances need not be provable.
+
+    Raises FileUnreadable, ConfigInvalid.
+    """
+    return _load(Path(path), JobFile, job_document_findings, lambda job: check_job(cell, job, proof=proof))
 
 
 def default_job_path(cell_path: Path | str) -> Path:
