@@ -7,13 +7,13 @@ It shares nothing with the driver: checksum and grammar are its own. One request
 from __future__ import annotations
 
 import asyncio
-import random
 import re
 from dataclasses import dataclass
 
 import numpy as np
 
 from sim.tracker.crc import checksum
+from sim.tracker.faults import FaultyOptics, FaultySender, OpticsFaults, WireFaults
 from sim.tracker.optics import Array, Optics, Shot
 from sim.wires.pacing import DeviceEnd
 
@@ -30,27 +30,25 @@ _TARGET = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.\-]{0,31}")
 
 
 @dataclass
-class LineFaults:
+class LineFaults(OpticsFaults, WireFaults):
     """Run-time faults; each stays until it is set back."""
 
-    silent: bool = False
-    """sends nothing at all, as if switched off"""
-    bad_crc: bool = False
-    """every line carries a wrong checksum"""
-    garbage_bytes: int = 0
-    """so many random bytes before every line"""
+    slow_s: float = 0.0
+    """so much longer a measurement takes; the heartbeats go on"""
     stale: bool = False
     """answers a measurement with the coordinates and the time of the one before"""
-    late_s: float = 0.0
-    """extra delay before the answer of a measurement"""
-    cut_to: int | None = None
-    """only the first so many bytes of a line leave"""
+    wrong_seq: bool = False
+    """points carry the number of the request before"""
+    wrong_target: str = ""
+    """points name this target, whichever was asked for"""
     zero: bool = False
     """coordinates exactly zero, flagged valid"""
     extra_flags: int = 0
     """bits added to the flags of a point"""
     clear_flags: int = 0
     """bits removed from the flags of a point"""
+    clock_us: int = 0
+    """added to the device's clock: a jump"""
 
 
 class LineTrackerDevice:
@@ -59,8 +57,8 @@ class LineTrackerDevice:
     def __init__(self, optics: Optics, wire: DeviceEnd, loop: asyncio.AbstractEventLoop, seed: int = 0) -> None:
         self.faults = LineFaults()
         self.requests = 0
-        self._optics, self._wire, self._loop = optics, wire, loop
-        self._noise = random.Random(seed)
+        self._optics, self._loop = FaultyOptics(optics, self.faults), loop
+        self._out = FaultySender(wire, loop, self.faults, seed)
         self._input = b""
         self._beats = 0
         self._timers: list[asyncio.TimerHandle] = []
@@ -112,7 +110,7 @@ class LineTrackerDevice:
             self._send("ERR", seq, BAD_ARGUMENT, "target, count 1..99 or face")
             return
         self.close()
-        duration_s = int(count) * self._optics.measure_s + self.faults.late_s
+        duration_s = int(count) * self._optics.measure_s + self.faults.slow_s
         finish = self._loop.call_later(duration_s, self._finish, seq, target, int(count), int(face))
         self._timers = [finish, self._loop.call_later(HEARTBEAT_S, self._beat)]
 
@@ -122,7 +120,7 @@ class LineTrackerDevice:
         self._timers[1] = self._loop.call_later(HEARTBEAT_S, self._beat)
 
     def _clock_us(self) -> int:
-        return round(self._loop.time() * 1e6)
+        return round(self._loop.time() * 1e6) + self.faults.clock_us
 
     def _finish(self, seq: int, target: str, count: int, face: int) -> None:
         self.close()
@@ -132,11 +130,10 @@ class LineTrackerDevice:
             return
         fresh = (self._clock_us(), self._point_fields(target, shots, face))
         t_us, rest = self._previous if self.faults.stale and self._previous is not None else fresh
-        if self.faults.stale:
-            rest = ",".join([target, *rest.split(",")[1:]])
+        rest = ",".join([self.faults.wrong_target or target, *rest.split(",")[1:]])
         self._previous = (t_us, rest)
         self._last[target] = (t_us, rest)
-        self._send("PNT", seq, t_us, rest)
+        self._send("PNT", seq - 1 if self.faults.wrong_seq else seq, t_us, rest)
 
     def _point_fields(self, target: str, shots: list[Shot], face: int) -> str:
         p_mm: Array = np.mean([shot.p_T_mm for shot in shots], axis=0)
@@ -153,7 +150,4 @@ class LineTrackerDevice:
     def _send(self, kind: str, *fields: object) -> None:
         body = ",".join(map(str, (kind, *fields))).encode("ascii")
         crc = checksum(body) ^ (0x0001 if self.faults.bad_crc else 0)
-        line = b"$" + body + b"*" + f"{crc:04X}".encode("ascii") + b"\r\n"
-        line = self._noise.randbytes(self.faults.garbage_bytes) + line[: self.faults.cut_to]
-        if not self.faults.silent:
-            self._wire.write(line)
+        self._out.send(b"$" + body + b"*" + f"{crc:04X}".encode("ascii") + b"\r\n")

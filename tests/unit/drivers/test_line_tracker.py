@@ -181,9 +181,9 @@ def test_silence_is_noticed_within_a_second_not_at_the_deadline() -> None:
 
 def test_a_slow_device_that_is_alive_has_until_the_deadline() -> None:
     async def scenario(bench: Bench) -> None:
-        bench.device.faults.late_s = 11.0
+        bench.device.faults.slow_s = 11.0
         await bench.tracker.measure("N1", NEAR)
-        bench.device.faults.late_s = 14.0
+        bench.device.faults.slow_s = 14.0
         start_s = bench.loop.time()
         with pytest.raises(DeviceSilent) as caught:
             await bench.tracker.measure("N1", NEAR)
