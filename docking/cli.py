@@ -13,6 +13,7 @@ from typing import Any
 
 import click
 
+from docking.cli_survey import layout
 from docking.errors import (
     EXIT_FAULT,
     EXIT_OK,
@@ -218,7 +219,7 @@ def sim(cell: Path, job: Path | None, seed: int, wires: Path | None, trace: Path
 @click.argument("nominal", type=FILE)
 @click.argument("measured", type=FILE)
 @click.option(
-    "--method", type=click.Choice(["svd", "three-point", "least-squares"]), default="least-squares", show_default=True
+    "--method", type=click.Choice(["ml", "svd", "three-point", "least-squares"]), default="ml", show_default=True
 )
 @json_option
 def fit(nominal: Path, measured: Path, method: str, as_json: bool) -> int:
@@ -274,6 +275,9 @@ def study_dock(cells: tuple[Path, ...], as_json: bool, **options: Any) -> int:
     else:
         click.echo(study_text(result))
     return EXIT_OK
+
+
+cli.add_command(layout)
 
 
 def _say(as_json: bool) -> Callable[[str], None]:

@@ -27,8 +27,8 @@ _SINGULAR = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Points (n, 3) of one body where they will be measured, in one frame, with the covariances (n, 3, 3) of the averaged
-    reading and the nominal together; 1 sigma of the body's unknown relative expansion (0: none is fitted)."""
+    """Points (n, 3) of one body where they will be measured, in one frame, with the covariances (n, 3, 3) of averaged
+    reading and nominal together; 1 sigma of the body's unknown relative expansion (0: none is fitted)."""
 
     names: tuple[str, ...]
     xyz_mm: Array
@@ -83,7 +83,8 @@ def normal_of(layout: Layout) -> Normal:
 
 
 def _terms(layout: Layout, pivot_mm: Array, unit: Array) -> tuple[Array, Array]:
-    return design(layout.xyz_mm, pivot_mm)[:, :, : len(unit)] * unit, np.linalg.inv(layout.cov_mm2)
+    weight = np.asarray(np.linalg.inv(layout.cov_mm2), dtype=np.float64)
+    return design(layout.xyz_mm, pivot_mm)[:, :, : len(unit)] * unit, weight
 
 
 def _each(a: Array, weight: Array) -> Array:
@@ -126,9 +127,9 @@ def shares_without(layout: Layout, aims: Aims) -> Array:
 class Reliability:
     """How well a wrong point would be noticed, (n,) by point.
 
-    `redundancy` 0..1: the part of an error that shows in the point's own residual. `detectable_mm`: size of an error, in
-    its least visible direction, that the test of the point finds with probability POWER. `harm_mm`: most that an error
-    which is found no more often moves a docking feature (external reliability). inf where nothing would be noticed.
+    `redundancy` 0..1: the part of an error that shows in the point's own residual. `detectable_mm`: size of an error,
+    in its least visible direction, that the test of the point finds with probability POWER. `harm_mm`: most that an
+    error which is found no more often moves a docking feature (external reliability). inf: nothing would be noticed.
     """
 
     redundancy: Array
@@ -149,15 +150,13 @@ def reliability(layout: Layout, aims: Aims, false_alarm: float) -> Reliability:
     redundancy = np.trace(v @ w, axis1=1, axis2=2) / 3.0
     noncentrality = float(special.chndtrinc(chi2_upper(false_alarm / n, 3), 3.0, 1.0 - POWER))
     reach = (design(aims.xyz_mm, normal.pivot_mm)[:, :, :p] * normal.unit).reshape(-1, p)
-    found = [
-        _unnoticed(w[i] @ v[i] @ w[i], reach @ cov @ a[i].T @ w[i], float(np.trace(w[i]))) for i in range(n)
-    ]
+    found = [_unnoticed(w[i] @ v[i] @ w[i], reach @ cov @ a[i].T @ w[i], float(np.trace(w[i]))) for i in range(n)]
     detectable, harm = np.sqrt(noncentrality * np.array(found)).T
     return Reliability(redundancy, detectable, harm)
 
 
 def _unnoticed(shown: Array, moved: Array, size: float) -> tuple[float, float]:
-    """Largest |e|^2 and largest squared shift of a feature over errors with e^T M e = 1; (inf, inf) where M is singular.
+    """Largest |e|^2 and largest squared shift of a feature over errors with e^T M e = 1; inf where M is singular.
 
     `shown` M (3, 3); `moved` (3f, 3) how an error moves the features.
     """
@@ -189,8 +188,8 @@ class Direction(NamedTuple):
 def directions(cov: Array, lever_mm: float, R: Array) -> tuple[Direction, ...]:
     """Principal directions, the weakest first, of the covariance (7, 7) of a pose about its pivot.
 
-    Rotations count with `lever_mm`, so that mm compare with mm; vectors are told in the frame whose axes are the columns
-    of `R` (3, 3).
+    Rotations count with `lever_mm`, so that mm compare with mm; vectors are told in the frame whose axes are the
+    columns of `R` (3, 3).
     """
     turn = linalg.block_diag(R.T, R.T)
     unit = np.array([lever_mm] * 3 + [1.0] * 3)

@@ -27,6 +27,7 @@ MODBUS = CELLS / "lab-modbus.toml"
 COMMANDS = (
     ["check"],
     ["plan"],
+    ["layout"],
     ["dry-run"],
     ["run"],
     ["sim"],
@@ -212,7 +213,7 @@ def test_an_interrupted_rehearsal_exits_with_4() -> None:
         (("dry-run", LAB, "--seed", "-1"), "-1"),
         (("dry-run", LAB, LAB, "third"), "third"),
         (("fit", "a.csv"), "MEASURED"),
-        (("fit", "a.csv", "b.csv", "--method", "ml"), "least-squares"),
+        (("fit", "a.csv", "b.csv", "--method", "best"), "least-squares"),
         (("run", LAB), "--step"),
         (("run", LAB, "--step", "--wires", "w.json"), "--sim"),
         (("study", "doc"), "dock"),
