@@ -59,7 +59,7 @@ def _refused(error: PoseError) -> dict[str, Any]:
     }
 
 
-def fit_files(nominal_path: str | Path, measured_path: str | Path, method: str = "least-squares") -> dict[str, Any]:
+def fit_files(nominal_path: str | Path, measured_path: str | Path, method: str = "ml") -> dict[str, Any]:
     """Screen and fit MEASURED to NOMINAL; the JSON object of `docking fit`.
 
     `pose` is X_MN (nominal into measured coordinates); `residuals_mm` measured minus fitted, passes averaged;

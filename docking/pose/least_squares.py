@@ -16,7 +16,7 @@ from docking.geometry import euler_to_matrix, exp_so3, skew
 from docking.pose.three_point import fit_three_point
 from docking.types import Array, Pose
 
-_MAX_ITERATIONS = 60
+MAX_ITERATIONS = 60
 
 
 class Solution(NamedTuple):
@@ -30,7 +30,7 @@ class Solution(NamedTuple):
     expansion: float
 
 
-def _step_limit_mm(points_mm: Array) -> float:
+def step_limit_mm(points_mm: Array) -> float:
     """A step below this is rounding: the points move by less than a few units in the last place."""
     return 1e-11 + 8.0 * float(np.finfo(np.float64).eps) * float(np.max(np.abs(points_mm)))
 
@@ -51,25 +51,31 @@ def euler_jacobian(alpha_rad: float, beta_rad: float, gamma_rad: float, nominal_
     return jac
 
 
-def fit_gauss_newton(nominal_mm: Array, measured_mm: Array, start: Pose | None = None) -> tuple[Pose, int]:
-    """Equal-weight minimum of [Luo] Eq. 9 by Gauss-Newton, Eq. 12, from the three-point pose; with its iterations.
+def fit_gauss_newton(
+    nominal_mm: Array, measured_mm: Array, start: Pose | None = None, weights: Array | None = None
+) -> tuple[Pose, int]:
+    """Minimum of [Luo] Eq. 9 by Gauss-Newton, Eq. 12, from the three-point pose; with its iterations.
+
+    `weights` (n,) of the points' squares, equal by default.
 
     The points are centred and the angles scaled by the rms radius, so the system is well conditioned at any distance.
     The angles count from a base rotation, at first the start's, that follows when beta grows: no gimbal lock is met.
     """
-    j0, p0 = nominal_mm.mean(axis=0), measured_mm.mean(axis=0)
+    w = np.full(len(nominal_mm), 1.0 / len(nominal_mm)) if weights is None else weights / weights.sum()
+    root = np.sqrt(w * len(w))[:, None]
+    j0, p0 = w @ nominal_mm, w @ measured_mm
     j, p = nominal_mm - j0, measured_mm - p0
     X = fit_three_point(nominal_mm, measured_mm) if start is None else start
     base, angles, t = X.R, np.zeros(3), X.apply(j0) - p0
     radius = float(np.sqrt(np.mean(np.sum(j * j, axis=1))))
     scale = np.array([1.0 / radius] * 3 + [1.0] * 3)
-    for iteration in range(1, _MAX_ITERATIONS + 1):
+    for iteration in range(1, MAX_ITERATIONS + 1):
         turned = j @ base.T
-        f = turned @ euler_to_matrix(*angles).T + t - p
-        a = euler_jacobian(angles[0], angles[1], angles[2], turned).reshape(-1, 6) * scale
+        f = root * (turned @ euler_to_matrix(*angles).T + t - p)
+        a = (root[:, :, None] * euler_jacobian(angles[0], angles[1], angles[2], turned)).reshape(-1, 6) * scale
         step = np.linalg.lstsq(a, -f.reshape(-1), rcond=1e-12)[0]
         angles, t = angles + step[:3] * scale[:3], t + step[3:]
-        if float(np.linalg.norm(step)) < _step_limit_mm(j):
+        if float(np.linalg.norm(step)) < step_limit_mm(j):
             R = euler_to_matrix(*angles) @ base
             return Pose(R, p0 + t - R @ j0), iteration
         if abs(float(angles[1])) > 1.0:
@@ -94,15 +100,25 @@ def weighted_centroid(points_mm: Array, cov_mm2: Array) -> Array:
     return result
 
 
-def _solve(normal: Array, rhs: Array, radius_mm: float, free: int) -> tuple[Array, Array]:
-    """Step (7,) and covariance (7, 7) of scaled normal equations; parameters from `free` on are held at zero."""
-    scale = np.array([1.0 / radius_mm] * 3 + [1.0] * 3 + [1.0 / radius_mm])[:free]
-    n = normal[:free, :free] * np.outer(scale, scale)
-    step, cov = np.zeros(7), np.zeros((7, 7))
-    inverse = np.linalg.inv((n + n.T) / 2.0)
-    step[:free] = scale * (inverse @ (scale * rhs[:free]))
-    cov[:free, :free] = inverse * np.outer(scale, scale)
-    return step, cov
+def radius_mm(points_mm: Array, pivot_mm: Array) -> float:
+    """Root mean square distance of points (n, 3) from the pivot; it scales angles."""
+    off = points_mm - pivot_mm
+    return max(float(np.sqrt(np.vdot(off, off) / len(off))), 1e-9)
+
+
+def normal_equations(
+    X: Pose, expansion: float, points: tuple[Array, Array, Array, Array], pivot_mm: Array
+) -> tuple[Array, Array]:
+    """N = sum A^T S^-1 A (7, 7) and sum A^T S^-1 r (7,) at a pose, about the pivot.
+
+    `points` = nominal and measured (n, 3), nominal and measured covariance (n, 3, 3).
+    """
+    nominal_mm, measured_mm, nominal_cov, measured_cov = points
+    q = X.apply(nominal_mm)
+    a = design(q, pivot_mm)
+    r = measured_mm - q - expansion * (q - pivot_mm)
+    aw = (np.linalg.inv(measured_cov + X.R @ nominal_cov @ X.R.T) @ a).reshape(-1, 7).T
+    return aw @ a.reshape(-1, 7), aw @ r.reshape(-1)
 
 
 def fit_maximum_likelihood(
@@ -114,26 +130,27 @@ def fit_maximum_likelihood(
     Gauss-Newton on the manifold about the weighted centroid c of the measured points; with `expansion_sigma` > 0 a
     uniform expansion e about c is estimated too. The covariance is N^-1, N = sum A^T S^-1 A.
     """
-    nominal_cov, measured_cov = covs_mm2
-    X, e = start, 0.0
+    X, e, before = start, 0.0, np.inf
     free = 7 if expansion_sigma > 0.0 else 6
-    c = weighted_centroid(measured_mm, measured_cov + X.R @ nominal_cov @ X.R.T)
-    radius = max(float(np.sqrt(np.mean(np.sum((measured_mm - c) ** 2, axis=1)))), 1e-9)
-    for iteration in range(1, _MAX_ITERATIONS + 1):
-        q = X.apply(nominal_mm)
-        a = design(q, c)
-        weight = np.linalg.inv(measured_cov + X.R @ nominal_cov @ X.R.T)
-        r = measured_mm - q - e * (q - c)
-        aw = a.transpose(0, 2, 1) @ weight
-        normal, rhs = (aw @ a).sum(axis=0), (aw @ r[:, :, None]).sum(axis=0)[:, 0]
+    c = weighted_centroid(measured_mm, covs_mm2[1] + X.R @ covs_mm2[0] @ X.R.T)
+    radius, limit = radius_mm(measured_mm, c), step_limit_mm(measured_mm)
+    scale = np.array([1.0 / radius] * 3 + [1.0] * 3 + [1.0 / radius])[:free]
+    for iteration in range(1, MAX_ITERATIONS + 1):
+        normal, rhs = normal_equations(X, e, (nominal_mm, measured_mm, *covs_mm2), c)
         if free == 7:
             normal[6, 6] += expansion_sigma**-2
             rhs[6] -= e * expansion_sigma**-2
-        step, cov = _solve(normal, rhs, radius, free)
+        inverse = scale[:, None] * np.linalg.inv(normal[:free, :free] * (scale[:, None] * scale)) * scale
+        step = inverse @ rhs[:free]
         turn = exp_so3(step[:3])
         X = Pose(turn @ X.R, turn @ (X.t_mm - c) + c + step[3:6])
-        e += float(step[6])
-        moved = radius * (float(np.linalg.norm(step[:3])) + abs(float(step[6]))) + float(np.linalg.norm(step[3:6]))
-        if moved < _step_limit_mm(measured_mm):
+        turned, grown = float(np.linalg.norm(step[:3])), float(np.sum(step[6:]))
+        e += grown
+        moved = radius * (turned + abs(grown)) + float(np.linalg.norm(step[3:6]))
+        # Near the minimum every step is the same small share of the one before: the next would be lost in rounding.
+        if moved < limit or (moved < 1e-3 * before and moved * moved < limit * before):
+            cov = np.zeros((7, 7))
+            cov[:free, :free] = (inverse + inverse.T) / 2.0
             return Solution(X, iteration, cov, c, e)
+        before = moved
     raise NotCongruent("fit", "the weighted fit does not converge", value=len(nominal_mm), limit=len(nominal_mm))

@@ -19,12 +19,15 @@ def total_cov_mm2(nominal_cov: Array, measured_cov: Array, R: Array) -> Array:
     return result
 
 
-def unweighted_cov(points_M_mm: Array, cov_mm2: Array, pivot_mm: Array) -> Array:
-    """Covariance (6, 6) about the pivot of the EQUALLY weighted fit when its points have the covariances (n, 3, 3).
+def unweighted_cov(points_M_mm: Array, cov_mm2: Array, pivot_mm: Array, weights: Array | None = None) -> Array:
+    """Covariance (6, 6) about the pivot of the fit that weighs its points by `weights` (n,), by default EQUALLY,
+    whatever their covariances (n, 3, 3).
 
-    The estimate is `(A^T A)^-1 A^T r`, hence `(A^T A)^-1 A^T S A (A^T A)^-1`.
+    With B = sqrt(w) A and r weighted alike the estimate is `(B^T B)^-1 B^T r`, hence `(B^T B)^-1 B^T wS B (B^T B)^-1`.
     """
-    a = design(points_M_mm, pivot_mm)[:, :, :6]
+    w = np.ones(len(points_M_mm)) if weights is None else weights / weights.mean()
+    cov_mm2 = w[:, None, None] * cov_mm2
+    a = np.sqrt(w)[:, None, None] * design(points_M_mm, pivot_mm)[:, :, :6]
     radius = max(float(np.sqrt(np.mean(np.sum((points_M_mm - pivot_mm) ** 2, axis=1)))), 1e-9)
     scale = np.array([1.0 / radius] * 3 + [1.0] * 3)
     a = a * scale

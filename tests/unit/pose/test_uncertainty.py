@@ -41,24 +41,24 @@ def point_rms_mm(found: list[Fit]) -> float:
     return float(np.sqrt(np.mean(np.sum(off**2, axis=2))))
 
 
-@pytest.mark.parametrize(("method", "draws"), [("least-squares", 1500), ("svd", 600), ("three-point", 300)])
+@pytest.mark.parametrize(("method", "draws"), [("ml", 1500), ("svd", 600), ("three-point", 300)])
 def test_normalised_error_squared_is_six(method: str, draws: int) -> None:
     values = [nees(f, Pose.identity()) for f in fits(method, draws)]
     assert np.mean(values) == pytest.approx(6.0, abs=4.5 * np.sqrt(12.0 / draws))
 
 
 def test_the_nominal_covariance_counts_too() -> None:
-    values = [nees(f, Pose.identity()) for f in fits("least-squares", 600, 0.05)]
+    values = [nees(f, Pose.identity()) for f in fits("ml", 600, 0.05)]
     assert np.mean(values) == pytest.approx(6.0, abs=4.5 * np.sqrt(12.0 / 600))
 
 
 def test_chi_square_matches_its_degrees_of_freedom() -> None:
-    found = fits("least-squares", 800)
+    found = fits("ml", 800)
     assert np.mean([f.chi2 for f in found]) == pytest.approx(found[0].dof, abs=4.5 * np.sqrt(2 * 24 / 800))
 
 
 def test_weighted_fit_reaches_the_bound_and_svd_does_not() -> None:
-    ml, svd, three = (fits(m, 600) for m in ("least-squares", "svd", "three-point"))
+    ml, svd, three = (fits(m, 600) for m in ("ml", "svd", "three-point"))
     bound = float(np.sqrt(np.mean(np.trace(point_cov_mm2(ml[0], BARREL), axis1=1, axis2=2))))
     assert point_rms_mm(ml) == pytest.approx(bound, rel=0.05)
     assert point_rms_mm(svd) / point_rms_mm(ml) >= 1.10
@@ -66,14 +66,14 @@ def test_weighted_fit_reaches_the_bound_and_svd_does_not() -> None:
 
 
 def test_covariance_at_a_far_point_is_what_happens_there() -> None:
-    found, far = fits("least-squares", 1000), np.array([[12000.0, 500.0, 0.0]])
+    found, far = fits("ml", 1000), np.array([[12000.0, 500.0, 0.0]])
     off = np.array([(f.X_MN.apply(far) - far)[0] for f in found])
     measured = off.T @ off / len(off)
     assert np.allclose(measured, point_cov_mm2(found[0], far)[0], atol=0.15 * np.max(measured))
 
 
 def test_expansion_is_estimated_and_its_covariance_is_honest() -> None:
-    found, far = fits("least-squares", 800, expansion=20e-6), np.array([[9000.0, 0.0, 1000.0]])
+    found, far = fits("ml", 800, expansion=20e-6), np.array([[9000.0, 0.0, 1000.0]])
     assert np.std([f.expansion for f in found]) == pytest.approx(20e-6, rel=0.1)
     rng = np.random.default_rng(11)
     ratio = []
@@ -87,7 +87,7 @@ def test_expansion_is_estimated_and_its_covariance_is_honest() -> None:
 
 
 def test_rigid_fit_carries_no_expansion() -> None:
-    f = fits("least-squares", 1)[0]
+    f = fits("ml", 1)[0]
     assert f.expansion == 0.0
     assert f.expansion_cov is None
     assert np.allclose(f.predict(BARREL), f.X_MN.apply(BARREL))
