@@ -289,6 +289,9 @@ class FaultKind(Enum):
     NODE_RESTARTED = "the device restarted or left its operational state"
     HEARTBEAT_LOST = "the device fell silent"
     FOREIGN_SENDER = "somebody else commands the device"
+    STUCK = "an axis does not follow its command"
+    FOLLOWING_ERROR = "an axis hangs back too far"
+    LIMIT_SWITCH = "an axis came to its limit switch"
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,9 +299,13 @@ class Feedback:
     """One read-back of all axes (order of the cell file). Not copied: made once a cycle by a driver.
 
     `position_mm` (m,), `following_error_mm` (m,), `force_n` (m,) load on each axis along itself (NaN where no load
-    cell); `age_cycles` (m,) cycles since each axis last reported; `fraction_s` path time that a queue-playing device
-    reports (NaN where the host streams). `fault` is None or (axis, code, text) of the first axis in fault and
-    `fault_kind` says what about; `at_limit` (m,) are the axes that report a limit, None where none does.
+    cell); `age_cycles` (m,) cycles since each axis last reported. `fault` is None or (axis, code, text) of the first
+    axis in fault and `fault_kind` says what about; `at_limit` (m,) are the axes that report a limit, None where none
+    does.
+
+    Of devices that play a queue: `path_times_s` (m,) the path time that each position belongs to, `path_time_s` the
+    least of them, `path_skew_s` by how much the path times are apart for certain at one instant. NaN, None and 0 where
+    the host streams.
     """
 
     t_s: float
@@ -311,6 +318,8 @@ class Feedback:
     fault: tuple[str, int, str] | None = None
     at_limit: NDArray[np.bool_] | None = None
     fault_kind: FaultKind = FaultKind.DRIVE_FAULT
+    path_times_s: Array | None = None
+    path_skew_s: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,8 @@ from docking.errors import (
     OutcomeUnknown,
     SegmentRejected,
 )
-from docking.types import Array, AxisState, Feedback, Identity, Plan
+from docking.types import Array, AxisState, FaultKind, Feedback, Identity, Plan
+from drivers.path_clocks import PathClock, apart_s
 from drivers.positioner_plc import ENABLE_S, PositionerPlc, Segments
 from drivers.register_map import load_map
 
@@ -100,8 +101,8 @@ class ModbusPositioners:
         self._depth = math.ceil((0.5 * self._bus.ramp_s + RESERVE_S) / self.segment_s) + 2
         self._plcs: tuple[PositionerPlc, ...] = ()
         self._watches: tuple[_Watch, ...] = ()
+        self._clocks: tuple[PathClock, ...] = ()
         self._alone = asyncio.Lock()
-        self.path_spread_s = float("nan")
         self.on_lost: Callable[[], None] = lambda: None
         self._stuck_mm = cell.limits.stuck_mm
         self.ramp_s = self.quick_ramp_s = self._bus.ramp_s
@@ -118,6 +119,9 @@ class ModbusPositioners:
             PositionerPlc(p, self._bus, self._map, self._addresses[p.name]) for p in self._cell.positioners
         )
         self._watches = tuple(_Watch(self._bus.scan_s) for _ in self._plcs)
+        # Two controllers, or one and the host: each off by no more than the cell's clocks are.
+        drift = 2e-6 * self._bus.clock_ppm
+        self._clocks = tuple(PathClock(self._bus.scan_s, self._bus.ramp_s, drift) for _ in self._plcs)
         settings = self._settings()
         identities = tuple(await self._all(plc.bring_up(settings) for plc in self._plcs))
         for plc in self._plcs:
@@ -166,6 +170,7 @@ class ModbusPositioners:
             for i, plc in enumerate(self._plcs):
                 rows = tuple(map(tuple, raw[:, 3 * i : 3 * i + 3].tolist()))
                 plc.take(Segments(plan.plan_id & 0xFFFFFFFF, round(self.segment_s * 1000), rows))
+                self._clocks[i].forget()
             await self._all(self._prefill(plc) for plc in self._plcs)
 
     def _quick_ramp_of(self, plan: Plan) -> float:
@@ -338,9 +343,9 @@ class ModbusPositioners:
         words = np.array([axis for plc in self._plcs for axis in plc.status.axes], dtype=np.float64).T
         raw = words[:3] * self._units
         raw[2, words[2] == self._map.scale["no_force"]] = np.nan
-        heard = [plc for plc, watch in zip(self._plcs, self._watches, strict=True) if not watch.age]
-        times = [plc.path_time_s() for plc in heard or self._plcs]
-        self.path_spread_s = max(times) - min(times)
+        times = [plc.path_time_s() for plc in self._plcs]
+        heard = [k for k, watch in enumerate(self._watches) if not watch.age]
+        fault = self._fault()
         at_limit = (words[3].astype(np.int64) & self._map.flags["axis_limit"]) != 0
         return Feedback(
             t_s=asyncio.get_running_loop().time(),
@@ -349,10 +354,20 @@ class ModbusPositioners:
             force_n=raw[2],
             states=self._states(),
             age_cycles=np.repeat([float(watch.age) for watch in self._watches], 3),
-            path_time_s=min(times),
-            fault=self._fault(),
+            path_time_s=min(times[k] for k in heard or range(len(times))),
+            fault=fault,
             at_limit=at_limit if at_limit.any() else None,
+            fault_kind=self._map.kind(fault[1]) if fault is not None else FaultKind.DRIVE_FAULT,
+            path_times_s=np.repeat(times, 3),
+            path_skew_s=self._skew_s(heard),
         )
+
+    def _skew_s(self, heard: list[int]) -> float:
+        """By how much the path times of those that were heard in this cycle are apart for certain."""
+        for k in heard:
+            self._clocks[k].see(self._plcs[k].shown(), self._rate)
+        now_s = asyncio.get_running_loop().time()
+        return apart_s((self._clocks[k] for k in heard), now_s, self._rate)
 
     def _states(self) -> tuple[AxisState, ...]:
         """State of each axis; a passive axis follows the component and counts as disabled."""

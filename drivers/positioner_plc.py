@@ -26,6 +26,7 @@ from docking.errors import (
 )
 from docking.types import Identity
 from drivers.modbus_client import ModbusUnit
+from drivers.path_clocks import Shown
 from drivers.register_map import RegisterMap
 
 ACKNOWLEDGE_S = 0.15
@@ -82,6 +83,7 @@ class PositionerPlc:
         self.capacity = 0
         self.depth = 0
         self.status = Status({}, [])
+        self._asked_s = self._heard_s = float("nan")
 
     # identity and settings -----------------------------------------------------------------------------------------
     async def bring_up(self, settings: Mapping[str, int]) -> Identity:
@@ -162,11 +164,14 @@ class PositionerPlc:
     async def _beat_and_read(self, address: int, window: bytes) -> None:
         self._heartbeat = (self._heartbeat + 1) & 0xFFFF
         block = self._blocks["status"]
+        loop = asyncio.get_running_loop()
+        asked_s = loop.time()
         data = self._heartbeat.to_bytes(2, "big") + window
         head, axes = block.unpack(await self.unit.exchange(address, data, block.address, block.count))
         if head["station"] != self._station:
             raise WrongIdentity(self.where, "Compared: station number.", value=head["station"], limit=self._station)
         self.status = Status(head, axes)
+        self._asked_s, self._heard_s = asked_s, loop.time()
         self.depth = self.capacity - head["fifo_free"]
 
     async def reach(self, within_s: float, *states: str) -> None:
@@ -306,6 +311,13 @@ class PositionerPlc:
         behind = (self._number(self.pushed) - head["play_seq"]) % 0xFFFF
         played = self.pushed - behind - 1 + head["fraction"] / self._map.scale["fraction"]
         return played * self._segments.dt_ms / 1000.0
+
+    def shown(self) -> Shown:
+        """What the newest read-back tells of path time."""
+        state = self.state
+        moving = state in ("running", "stopping")
+        scans = self.status.head["hb_plc"]
+        return Shown(self.path_time_s(), state == "running", moving, scans, self._asked_s, self._heard_s)
 
     async def close(self) -> None:
         """Disable, wait for closed brakes, disconnect; a broken connection is only closed.

@@ -9,6 +9,8 @@ from functools import cache
 from importlib import resources
 from typing import Any
 
+from docking.types import FaultKind
+
 _CODES = {"u16": "H", "i16": "h", "u32": "I", "i32": "i"}
 
 
@@ -59,6 +61,7 @@ class RegisterMap:
         self.commands: dict[str, int] = table["commands"]
         self.states: dict[int, str] = {code: name for name, code in table["states"].items()}
         self.consequences: frozenset[int] = frozenset(table["consequences"]["faults"])
+        self._kinds = {int(code): FaultKind[name] for code, name in table["kinds"].items()}
         self._faults: dict[str, str] = table["faults"]
         self._rejects: dict[str, str] = table["rejects"]
         self.blocks = {
@@ -69,6 +72,10 @@ class RegisterMap:
     def fault(self, code: int) -> str:
         """Words for a fault code."""
         return self._faults.get(str(code), f"fault {code}, not in the map")
+
+    def kind(self, code: int) -> FaultKind:
+        """What a fault code is about."""
+        return self._kinds.get(code, FaultKind.DRIVE_FAULT)
 
     def reject(self, code: int) -> str:
         """Words for a rejected segment or command."""

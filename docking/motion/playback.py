@@ -27,6 +27,7 @@ class Playback:
         self._from, self._to, self._since, self._span = share, share, 0.0, 0.0
         self._q = plan.q_mm
         self._last = len(plan.q_mm) - 1
+        self._columns = np.arange(plan.q_mm.shape[1])
         self._period = plan.period_s
 
     def hold(self) -> None:
@@ -104,12 +105,20 @@ class Playback:
             return exact
         return position_at(self.plan, path_time_s)
 
-    def chord_at(self, path_time_s: float) -> Array:
-        """Where devices that interpolate each axis linearly between rows stand (m,) at a path time."""
-        position = min(max(path_time_s / self._period, 0.0), float(self._last))
-        row = min(int(position), self._last - 1)
-        between: Array = self._q[row] + (position - row) * (self._q[row + 1] - self._q[row])
+    def chord_at(self, path_time_s: Array | float) -> Array:
+        """Where devices that interpolate each axis linearly between rows stand (m,) at a path time, one for all or one
+        for each axis (m,)."""
+        position = np.minimum(np.maximum(np.asarray(path_time_s) / self._period, 0.0), self._last)
+        row = np.minimum(position.astype(np.intp), self._last - 1)
+        start = self._q[row, self._columns]
+        between: Array = start + (position - row) * (self._q[row + 1, self._columns] - start)
         return between
+
+    def slope_at(self, path_time_s: Array | float) -> Array:
+        """Axis speeds (m,) in mm/s of the table at full rate, at a path time, one for all or one for each axis."""
+        row = np.minimum(np.maximum(np.asarray(path_time_s) / self._period, 0.0).astype(np.intp), self._last - 1)
+        slope: Array = np.abs(self._q[row + 1, self._columns] - self._q[row, self._columns]) / self._period
+        return slope
 
     def speed_at(self, path_time_s: float) -> Array:
         """Axis speeds (m,) in mm/s of the table at a path time, times the present rate."""

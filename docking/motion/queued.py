@@ -40,6 +40,8 @@ TRACE_PERIOD_S = 0.1
 BRAKE_S = 2.0
 TOLD_S = 0.5
 """In so long a stop has reached every controller that can be reached, and its end has been seen."""
+GOLDEN, SHARE = 0.618, 0.2
+"""Polls come up to this share of their period early, spread evenly."""
 RESET_S = 0.3
 """How long nothing may be found again after the controllers were told to forget their faults."""
 
@@ -85,7 +87,7 @@ class QueuedMotion:
         self._keeper: asyncio.Task[None] | None = None
         self._sleeper: asyncio.Future[None] | None = None
         self._cycled = asyncio.Event()
-        self._cycles, self._keeping, self._polled_s = 0, False, 0.0
+        self._cycles, self._keeping, self._polled_s, self._phase = 0, False, 0.0, 0.0
         positioners.on_lost = self._wake
 
     # the port ----------------------------------------------------------------------------------------------------
@@ -255,7 +257,9 @@ class QueuedMotion:
         """
         loop = asyncio.get_running_loop()
         self._sleeper = loop.create_future()
-        timer = loop.call_at(self._polled_s + self._poll_s, self._wake)
+        # Never in step with the scans: the phase decides how old the path time is that a read-back shows.
+        self._phase = (self._phase + GOLDEN) % 1.0
+        timer = loop.call_at(self._polled_s + self._poll_s * (1.0 - SHARE * self._phase), self._wake)
         try:
             await self._sleeper
         finally:
@@ -352,9 +356,12 @@ class QueuedMotion:
         if move is None:
             finding = self._watch.evaluate(feedback, self._commanded, 0.0, moving=False, may_stop=may_stop)
         else:
-            at_s = feedback.path_time_s
-            chord, speed = move.playback.chord_at(at_s), move.playback.speed_at(at_s)
+            # Controllers are read in different scans: each axis belongs to the path time that its own one shows.
+            at_s = feedback.path_time_s if feedback.path_times_s is None else feedback.path_times_s
+            chord, slope = move.playback.chord_at(at_s), move.playback.slope_at(at_s)
+            speed = move.playback.rate * slope
             finding = self._watch.evaluate(feedback, chord, speed, moving=True, may_stop=may_stop)
+            finding = finding or self._watch.parted(feedback, slope)
         if finding is not None:
             self._raise(finding.trigger, finding.error)
 
@@ -390,8 +397,8 @@ class QueuedMotion:
     def _end_stop(self) -> None:
         """The axes have come to rest after a stop: end the move, if there is one."""
         move, feedback = self._move, self._feedback
-        if self._applied >= Reaction.FAST_PPS:
-            # The controllers have braked and taken the torque.
+        if self._applied >= Reaction.FAST_PPS or (feedback is not None and AxisState.FAULT in feedback.states):
+            # The controllers have braked and taken the torque, or will: a fault of their own ends with that.
             self.arbiter.enter(Mode.OFF)
         if move is not None and feedback is not None:
             self._finish("fault" if self.arbiter.latched else "done" if move.ended(feedback) else "stopped")

@@ -22,17 +22,19 @@ from docking.errors import (
     DeviceSilent,
     DockingError,
     DriveFault,
+    FeedbackMissing,
     LinkLost,
-    MotionError,
     ReadBackMismatch,
     WrongIdentity,
 )
 from docking.kinematics import internal_force_matrix, socket_positions
 from docking.kinematics.forces import consistency_projector
+from docking.motion.triggers import Trigger
 from sim.plc import registers as reg
 from tests.support.ready_modbus import ModbusScene, ReadyModbus, peak_mm_s, play_modbus
 
 POLL_S, TIMEOUT_S, SCAN_S = 0.05, 0.05, 0.01
+MISSING_CYCLES = 2
 TOLD_S = 3.0 * SCAN_S
 """A command takes a scan to be obeyed; the motors follow a little later."""
 LAB, FUSELAGE = ModbusScene(), ModbusScene("fuselage-modbus", shift_mm=12.0, speed_mm_s=5.0)
@@ -121,6 +123,7 @@ class Row:
     error: type[DockingError] | None
     where: str
     told_s: float
+    trigger: Trigger | None = None
     slow: bool = False
 
 
@@ -128,24 +131,29 @@ SILENT_S = POLL_S + 2.0 * TIMEOUT_S + TOLD_S
 ROWS = {
     "MB-01 reply lost once": Row(once("reply"), None, "", 0.0),
     "MB-01 request lost once": Row(once("request"), None, "", 0.0),
-    "MB-01 replies lost": Row(always("reply"), DeviceSilent, "positioner B", SILENT_S),
-    "MB-01 requests lost": Row(always("request"), DeviceSilent, "positioner B", SILENT_S, slow=True),
+    "MB-01 replies lost": Row(always("reply"), DeviceSilent, "positioner B", SILENT_S, Trigger.FEEDBACK_MISSING),
+    "MB-01 requests lost": Row(
+        always("request"), DeviceSilent, "positioner B", SILENT_S, Trigger.FEEDBACK_MISSING, slow=True
+    ),
     "MB-02 busy once": Row(once(exception(6)), None, "", 0.0),
-    "MB-02 busy": Row(always(exception(6)), DeviceRefused, "positioner B", 2.0 * POLL_S + TOLD_S),
-    "MB-02 device failure": Row(once(exception(4)), DeviceRefused, "positioner B", POLL_S + TOLD_S),
-    "MB-03 connection reset": Row(reset, LinkLost, "positioner B", 0.005 + TOLD_S),
-    "MB-03 all reset": Row(reset_all, LinkLost, "positioner", 0.12 + TOLD_S, slow=True),
+    "MB-02 busy": Row(always(exception(6)), DeviceRefused, "positioner B", 2.0 * POLL_S + TOLD_S, Trigger.DRIVE_FAULT),
+    "MB-02 device failure": Row(
+        once(exception(4)), DeviceRefused, "positioner B", POLL_S + TOLD_S, Trigger.DRIVE_FAULT
+    ),
+    "MB-03 connection reset": Row(reset, LinkLost, "positioner B", 0.005 + TOLD_S, Trigger.HEARTBEAT_LOST),
+    "MB-03 all reset": Row(reset_all, LinkLost, "positioner", 0.12 + TOLD_S, Trigger.HEARTBEAT_LOST, slow=True),
     "MB-04 reply cut short": Row(once(cut), None, "", 0.0),
-    "MB-04 replies cut short": Row(always(cut), DeviceSilent, "positioner B", SILENT_S),
+    "MB-04 replies cut short": Row(always(cut), DeviceSilent, "positioner B", SILENT_S, Trigger.FEEDBACK_MISSING),
     "MB-05 late replies": Row(late_by_one, None, "", 0.0),
-    "MB-05 registers frozen": Row(freeze, MotionError, "", 4.0 * POLL_S + TOLD_S),
-    "MB-05 heartbeat not taken": Row(hang, DriveFault, "B.X", 0.12 + TOLD_S, slow=True),
-    "MB-06 other unit": Row(other_unit, WrongIdentity, "positioner B", POLL_S + TOLD_S),
-    "AX-05 limit switch": Row(press_limit, DriveFault, "B.Z", TOLD_S),
-    "AX-08 drive in fault": Row(fail_drive, DriveFault, "C.X", TOLD_S),
+    "MB-05 registers frozen": Row(
+        freeze, FeedbackMissing, "B.X", (MISSING_CYCLES + 1.0) * POLL_S + TOLD_S, Trigger.FEEDBACK_MISSING
+    ),
+    "MB-05 heartbeat not taken": Row(hang, DriveFault, "B.X", 0.12 + TOLD_S, Trigger.HEARTBEAT_LOST, slow=True),
+    "MB-06 other unit": Row(other_unit, WrongIdentity, "positioner B", POLL_S + TOLD_S, Trigger.DRIVE_FAULT),
+    "AX-05 limit switch": Row(press_limit, DriveFault, "B.Z", TOLD_S, Trigger.LIMIT_SWITCH),
 }
 """Positioner B is the victim. `slow`: its own watchdog stops it, along the ordinary ramp; it takes the others along.
-Frozen registers show as whatever comes first: read-backs that part from a rigid figure, or a heartbeat standing still.
+Frozen registers go on as if all were well, but for the number of the scan.
 """
 
 
@@ -185,6 +193,8 @@ def assert_row(scene: ModbusScene, name: str, monkeypatch: pytest.MonkeyPatch) -
     assert result.result == "fault"
     assert isinstance(result.cause, row.error), repr(result.cause)
     assert row.where in str(result.cause)
+    assert cell.motion.arbiter.first is not None
+    assert cell.motion.arbiter.first.trigger is row.trigger
     ramp_s = cell.cell.bus.ramp_s if row.slow else cell.motion._bus.quick_ramp_s  # type: ignore[union-attr]
     bound_s = row.told_s + ramp_s + 2.0 * SCAN_S
     stood_s = cell.stood_s()

@@ -26,6 +26,7 @@ def watch_limits(cell: CellFile) -> WatchLimits:
         passive_mm=limits.passive_mm,
         ball_rms_mm=limits.ball_rms_mm,
         ball_pair_mm=limits.ball_pair_mm,
+        sync_error_mm=limits.sync_error_mm,
         measured_force_n=limits.measured_force_n,
         measured_warp_n=limits.measured_warp_n,
         measured_whole_force_n=limits.measured_whole_force_n,

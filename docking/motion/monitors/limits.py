@@ -11,8 +11,8 @@ class WatchLimits:
 
     The following error may grow with the speed up to its ceiling. `measured_*` bound what the load cells show beyond
     the expected reactions: the change since the move was loaded, and, wider because cells drift and cross-talk, the
-    whole (`measured_whole_*`). `overload` and `underload` are fractions of the expected load of a ball; the rating of
-    an axis may be exceeded by `rating`.
+    whole (`measured_whole_*`). `sync_error` bounds what path times apart may squeeze. `overload` and `underload` are
+    fractions of the expected load of a ball; the rating of an axis may be exceeded by `rating`.
     """
 
     following_rest_mm: float
@@ -26,6 +26,7 @@ class WatchLimits:
     passive_mm: float = 0.5
     ball_rms_mm: float = 0.06
     ball_pair_mm: float = 0.15
+    sync_error_mm: float = 0.05
     measured_force_n: float = 1500.0
     measured_warp_n: float = 600.0
     measured_whole_force_n: float = 2500.0

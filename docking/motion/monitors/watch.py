@@ -134,7 +134,7 @@ class Watch:
     ) -> Finding | None:
         """The finding that asks for the most severe reaction, or None.
 
-        `q_ref_mm` (m,) is the rigid figure the read-back belongs to, `speed_mm_s` (m,) the commanded speed there.
+        `q_ref_mm` (m,) is where on the path the read-back belongs, `speed_mm_s` (m,) the commanded speed there.
         `moving` says that a move runs; `may_stop` says that an axis may be ramping down by itself, as a device does
         that was told to stop.
         """
@@ -257,6 +257,18 @@ class Watch:
             (Trigger.PREDICTED_WARP, WarpTrip, "Z axes", found.warp_n, limits.warp_force_n),
         )[case]
         return Finding(trigger, kind(where, cause, value=value, limit=limit))
+
+    def parted(self, feedback: Feedback, slope_mm_s: Array) -> Finding | None:
+        """Controllers whose path times are apart: by how much, at the axis speeds (m,) of the plan there, they squeeze
+        the part. Positions beside their own place on the path would not show it."""
+        fastest = float(np.sqrt(np.square(slope_mm_s.reshape(-1, 3)).sum(axis=1).max()))
+        apart_mm, limit = feedback.path_skew_s * fastest, self._limits.sync_error_mm
+        if self._margins.note("path_times", apart_mm / limit):
+            return None
+        times = feedback.path_times_s
+        last = "" if times is None else self._axes[int(np.argmin(times))].partition(".")[0]
+        cause = f"At least {1000.0 * feedback.path_skew_s:.0f} ms apart at {fastest:.2f} mm/s; {last} is last."
+        return Finding(Trigger.COUPLING, ConsistencyTrip("path times", cause, value=apart_mm, limit=limit))
 
     def _worst(self, off_mm: Array) -> str:
         """The axis that is farthest from its place on the path."""

@@ -182,13 +182,15 @@ def test_hold_and_resume_reach_the_end_with_the_path_never_left() -> None:
     play(scenario)
 
 
-def test_clock_skew_shows_as_spread_of_path_time() -> None:
+def test_clock_skew_shows_as_path_times_apart() -> None:
     async def scenario(bench: Bench) -> None:
         bench.plan = plan(cell(), 30.0)
         await bench.run()
-        await bench.poll_for(20.0)
-        # 20 s at 2000 ppm between the fastest and the slowest, read back in units of dt / 65536.
-        assert bench.driver.path_spread_s == pytest.approx(0.040, abs=0.0015)
+        feedback = await bench.poll_for(20.0)
+        # 20 s at 2000 ppm between the fastest and the slowest; polled in step with the scans all but one are certain.
+        assert 0.029 <= feedback.path_skew_s <= 0.0402
+        assert feedback.path_times_s[0] - feedback.path_times_s[3] == pytest.approx(0.040, abs=0.0105)
+        assert feedback.path_times_s[2] == feedback.path_times_s[0]
 
     play(scenario, ppm=(1000.0, -1000.0, 0.0, 0.0))
 

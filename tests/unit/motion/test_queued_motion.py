@@ -11,6 +11,7 @@ import pytest
 from docking.errors import (
     AxisNotEnabled,
     BadArgument,
+    ConsistencyTrip,
     Defect,
     DeviceSilent,
     DockingError,
@@ -26,7 +27,7 @@ from docking.motion.arbiter import Reaction
 from docking.motion.triggers import Finding, Trigger
 from docking.types import AxisState
 from sim.virtual_time import run_virtual
-from tests.support.motion_fakes import QueuedFake, watch_of
+from tests.support.motion_fakes import LIMITS, QueuedFake, watch_of
 from tests.support.planned_moves import a_plan, lab_site
 from tests.support.rigid_figure import path_gap_mm
 
@@ -40,9 +41,9 @@ POLL_S, RAMP_S = 0.05, 0.5
 class Bench:
     """A motion side, enabled, over the fake controllers."""
 
-    def __init__(self) -> None:
-        self.bus = QueuedFake(POSITIONERS.axes, np.array(PLAN.q_mm[0]), ramp_s=RAMP_S)
-        self.motion = QueuedMotion(self.bus, watch_of(POSITIONERS), POLL_S)
+    def __init__(self, kind=QueuedFake, limits=LIMITS) -> None:
+        self.bus = kind(POSITIONERS.axes, np.array(PLAN.q_mm[0]), ramp_s=RAMP_S)
+        self.motion = QueuedMotion(self.bus, watch_of(POSITIONERS, limits), POLL_S)
 
     async def begin(self):
         """Enable, load the plan, start it; returns the task of the move."""
@@ -51,11 +52,11 @@ class Bench:
         return asyncio.get_running_loop().create_task(self.motion.start(PLAN.plan_hash))
 
 
-def on_bench(scenario):
+def on_bench(scenario, kind=QueuedFake, limits=LIMITS):
     """Run `scenario(bench)` in virtual time, close, and see that nothing is left over."""
 
     async def main():
-        bench = Bench()
+        bench = Bench(kind, limits)
         result = await scenario(bench)
         await bench.motion.close()
         assert bench.bus.closed
@@ -204,6 +205,59 @@ def test_a_stop_overtakes_a_resume_that_waits():
         assert bench.bus.verbs == ["run", "hold", "stop"]
 
     on_bench(scenario)
+
+
+class InScans(QueuedFake):
+    """Four controllers, each read `age_s` after its last scan: path times and positions of different instants."""
+
+    age_s = np.array([0.0, 0.010, 0.004, 0.007])
+    skew_s = 0.0
+
+    async def poll(self, *, surviving=False):
+        feedback = await super().poll(surviving=surviving)
+        if self.loaded is None:
+            return feedback
+        times = np.repeat(np.maximum(self._path_s - self.age_s * self._rate, 0.0), 3)
+        table = self.loaded
+        position = np.array([np.interp(t, table.t_s, q) for t, q in zip(times, table.q_mm.T, strict=True)])
+        scan = {"path_times_s": times, "path_time_s": times.min(), "path_skew_s": self.skew_s}
+        return replace(feedback, position_mm=position, **scan)
+
+
+def test_read_backs_of_different_scans_are_no_squeeze():
+    """At 4 mm/s a scan is 0.04 mm: without their own path times the tight limits would trip."""
+    tight = replace(LIMITS, ball_residual_mm=0.001, warp_force_n=1.0, internal_force_n=20.0)
+
+    async def scenario(bench):
+        result = await (await bench.begin())
+        assert (result.result, result.cause) == ("done", None)
+        assert result.max_residual_mm <= 1e-6
+
+    on_bench(scenario, InScans, tight)
+
+
+@pytest.mark.parametrize(("skew_s", "trips"), [(0.8, False), (1.25, True)])
+@pytest.mark.parametrize("share", [1.0, 0.25])
+def test_path_times_apart_by_more_than_the_limit_stop_all(skew_s, trips, share):
+    """Each axis is on its path, but not at one place of it. The limit is a length: time apart times the plan's speed,
+    whatever the rate."""
+    slope = np.abs(np.diff(PLAN.q_mm, axis=0)).reshape(-1, 4, 3) / PLAN.period_s
+    limit_s = LIMITS.sync_error_mm / np.linalg.norm(slope, axis=2).max()
+
+    async def scenario(bench):
+        bench.motion.override(100.0 * share)
+        bench.bus.skew_s = skew_s * limit_s
+        result = await (await bench.begin())
+        if not trips:
+            assert result.result == "done"
+            return
+        assert_faulted(result, ConsistencyTrip, "path times")
+        assert "B is last" in str(result.cause)
+        assert result.cause.limit == LIMITS.sync_error_mm
+        assert bench.motion.arbiter.first.trigger is Trigger.COUPLING
+        assert bench.bus.verbs[-1] == "quick-stop"
+
+    on_bench(scenario, InScans)
 
 
 def assert_faulted(result, kind, where) -> None:
