@@ -29,31 +29,61 @@ MM_PER_M = 1000.0
 
 COM_NULL_PROC = 0
 COM_SET_DOUBLE_PRECISION = 107
+COM_GET_DOUBLE_PRECISION = 108
 CSV_INSTRUMENT_NO = 5003
 CSV_INSTRUMENT_NAME = 5004
+CSV_SW_VERSION = 5034
 TMC_DO_MEASURE = 2008
+TMC_GET_PRISM = 2023
+TMC_SET_PRISM = 2024
+TMC_SET_AIR = 2028
+TMC_GET_AIR = 2029
 TMC_GET_SIMPLE_MEA = 2108
+TMC_GET_FULL_MEAS = 2167
 AUT_MAKE_POSITIONING = 9027
+AUT_SEARCH = 9029
 AUT_FINE_ADJUST = 9037
 AUS_SET_USER_ATR = 18005
 
 RPC_NAMES = {
     COM_NULL_PROC: "NullProc",
     COM_SET_DOUBLE_PRECISION: "SetDoublePrecision",
+    COM_GET_DOUBLE_PRECISION: "GetDoublePrecision",
     CSV_INSTRUMENT_NO: "GetInstrumentNo",
     CSV_INSTRUMENT_NAME: "GetInstrumentName",
+    CSV_SW_VERSION: "GetSWVersion",
     TMC_DO_MEASURE: "DoMeasure",
+    TMC_GET_PRISM: "GetPrismCorr",
+    TMC_SET_PRISM: "SetPrismCorr",
+    TMC_SET_AIR: "SetAtmCorr",
+    TMC_GET_AIR: "GetAtmCorr",
     TMC_GET_SIMPLE_MEA: "GetSimpleMea",
+    TMC_GET_FULL_MEAS: "GetFullMeas",
     AUT_MAKE_POSITIONING: "MakePositioning",
+    AUT_SEARCH: "Search",
     AUT_FINE_ADJUST: "FineAdjust",
     AUS_SET_USER_ATR: "SetUserAtrState",
 }
+
+MOTOR_PROCEDURES = frozenset({AUT_MAKE_POSITIONING, AUT_SEARCH, AUT_FINE_ADJUST})
+"""They turn the instrument and can be aborted."""
+
+MEASUREMENTS = frozenset({TMC_GET_SIMPLE_MEA, TMC_GET_FULL_MEAS})
+
+ABORT_LINE = b"c\r\n"
+"""Stops a motorised function; the instrument answers with a question mark."""
 
 DEGRADED_CODES = frozenset({1283, 1284})
 """Values are returned, their accuracy is not guaranteed."""
 
 BUSY_CODES = frozenset({13, 1293})
 """Ask again shortly."""
+
+NOT_OFFERED = 3081
+"""The instrument does not have the procedure."""
+
+NOT_FOUND_CODES = frozenset({8704, 8710})
+"""Nothing in the window: a wider search may help."""
 
 TARGET_CODES = {
     1285: "angles without a distance",
@@ -94,6 +124,7 @@ class GeocomReply:
     params: tuple[str, ...]
 
 
+_START = b"%R1P,"
 _REPLY = re.compile(r"%R1P,(\d{1,5}),(\d{1,5})(,\d{1,5})?:(\d{1,5})((?:,.*)?)")
 _PARAM = re.compile(r',("(?:[^"\\]|\\.)*"|[^",]*)')
 _NUMBER = re.compile(r"-?\d{1,15}(?:\.\d{1,18})?(?:[eE][+-]?\d{1,2})?")
@@ -162,10 +193,14 @@ def point_from_polar(hz: float, v: float, slope_m: float) -> Array:
 
 
 class GeocomParser:
-    """Bytes in, replies out; a line that begins anew inside another ends the first as bad. Counts what it drops."""
+    """Bytes in, replies out; a line that begins anew inside another ends the first as bad.
+
+    Counts `bad` lines (a reply begun and not good) and `noise` bytes (what is no reply at all).
+    """
 
     def __init__(self, checksum: bool = False) -> None:
         self.bad = 0
+        self.noise = 0
         self._checksum = checksum
         self._rest = b""
 
@@ -174,24 +209,32 @@ class GeocomParser:
         *lines, rest = (self._rest + data).split(b"\r\n")
         replies: list[GeocomReply] = []
         for line in lines:
-            start = line.rfind(b"%R1P,")
-            self.bad += start != 0 and bool(line)
-            if start >= 0:
-                self._take(line[start:], replies)
+            self._take(line, replies)
         if len(rest) > LINE_MAX:
-            self.bad += 1
             # A reply may have begun in the noise: its start is kept, and so are the bytes that could begin one.
-            start = rest.rfind(b"%R1P,")
-            rest = rest[start:] if start >= 0 and len(rest) - start <= LINE_MAX else rest[-4:]
+            start = rest.rfind(_START)
+            kept = rest[start:] if start >= 0 and len(rest) - start <= LINE_MAX else rest[1 - len(_START) :]
+            self._drop(rest[: len(rest) - len(kept)])
+            rest = kept
         self._rest = rest
         return replies
 
     def _take(self, line: bytes, replies: list[GeocomReply]) -> None:
+        start = line.rfind(_START)
+        if start < 0:
+            self._drop(line if line.strip() != b"?" else b"")
+            return
+        self._drop(line[:start])
         try:
-            replies.append(decode_reply(line, self._checksum))
+            replies.append(decode_reply(line[start:], self._checksum))
         except ValueError:
             self.bad += 1
 
+    def _drop(self, piece: bytes) -> None:
+        begun = piece.count(_START)
+        self.bad += begun
+        self.noise += 0 if begun else len(piece)
+
     def reset(self) -> None:
-        """Forget the unfinished line; the count stays."""
+        """Forget the unfinished line; the counts stay."""
         self._rest = b""

@@ -38,6 +38,17 @@ def reading_covariance(model_mm2: Array, reported_sigma_mm: Array, resolution_mm
     return result
 
 
+def across_at_least(model_mm2: Array, p_T_mm: Array, sigma_rad: float) -> Array:
+    """The model (3, 3) mm^2, widened across the line of sight to `p_T_mm` (3,) where the instrument says that its
+    angles are worse: `sigma_rad` times the distance. Never narrowed; 0 (nothing reported) leaves the model."""
+    distance_mm = float(np.linalg.norm(p_T_mm))
+    sight = p_T_mm / distance_mm
+    across: Array = np.eye(3) - np.outer(sight, sight)
+    model_across_mm2 = 0.5 * float(np.trace(across @ model_mm2))
+    result: Array = model_mm2 + max(0.0, (sigma_rad * distance_mm) ** 2 - model_across_mm2) * across
+    return result
+
+
 class FrozenWatch:
     """Recognises a sensor that repeats itself: the same digits for another target, or thrice for one target."""
 

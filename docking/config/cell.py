@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from docking.config.base import Finite, Fraction, Model, Name, NonNegative, PoseVector, Positive, Vector3
+from docking.config.instruments import GeocomConfig
 
 
 class Noise(Model):
@@ -52,6 +53,7 @@ class TrackerConfig(Model):
         default=50.0,
         description="station drift assumed since the last reference check, um per hour, 1 sigma a coordinate",
     )
+    geocom: GeocomConfig | None = Field(default=None, description="settings of a GeoCOM instrument")
 
 
 class CanBus(Model):

@@ -27,7 +27,7 @@ class Air:
     def ppm(self) -> float:
         """First velocity correction of an infrared distance meter whose reference index is 1.00028634."""
         warm = 1.0 + self.dry_c / 273.15
-        saturated_hpa = 6.1078 * 10.0 ** (7.5 * self.wet_c / (237.3 + self.wet_c))
+        saturated_hpa: float = 6.1078 * 10.0 ** (7.5 * self.wet_c / (237.3 + self.wet_c))
         vapour_hpa = saturated_hpa - 0.000662 * self.pressure_hpa * (self.dry_c - self.wet_c)
         return 286.34 - (0.29525 * self.pressure_hpa - 0.04126 * vapour_hpa) / warm
 

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from typing import Any
 
 import numpy as np
 import pytest
 
 from docking.config.cell import ErsPoint, TrackerConfig
-from docking.errors import BadReply, DeviceRefused, DeviceSilent, LinkLost, TargetLost
+from docking.config.instruments import GeocomConfig
+from docking.errors import BadReply, DeviceRefused, DeviceSilent, LinkLost, ReadBackMismatch, TargetLost
 from docking.types import Array, Identity
 from drivers.geocom_tracker import GeocomTracker
+from sim.tracker.faults import flipped
 from sim.tracker.geocom import GeocomStation
+from sim.tracker.geocom_head import Air
 from sim.virtual_time import run_virtual
 from sim.wires.virtual_serial import VirtualSerial
 from tests.fakes.tracker_optics import POINTS, FakeOptics
@@ -36,12 +40,15 @@ def covariance(p_T_mm: Array) -> Array:
 class Bench:
     """One tracker, one station, one line."""
 
-    def __init__(self, *, checksum: bool = False, **changes: object) -> None:
+    def __init__(self, *, checksum: bool = False, geocom: dict[str, Any] | None = None, **changes: object) -> None:
+        geocom = geocom or {}
         self.loop = asyncio.get_running_loop()
         self.wire = VirtualSerial(self.loop, BAUD)
         self.optics = FakeOptics(noise_mm=0.0)
         self.station = GeocomStation(self.optics, self.wire.far, self.loop)
-        self.tracker = GeocomTracker(self.wire.near, config(**changes), covariance, checksum=checksum)
+        self.tracker = GeocomTracker(
+            self.wire.near, config(geocom=GeocomConfig(checksum=checksum, **geocom), **changes), covariance
+        )
 
     def on_the_wire(self) -> list[bytes]:
         """Both directions as they pass, from now on."""
@@ -52,9 +59,9 @@ class Bench:
         return seen
 
 
-def on_bench(scenario: Callable[[Bench], Awaitable[None]], *, checksum: bool = False, **changes: object) -> None:
+def on_bench(scenario: Callable[[Bench], Awaitable[None]], **changes: Any) -> None:
     async def main() -> None:
-        bench = Bench(checksum=checksum, **changes)
+        bench = Bench(**changes)
         await bench.tracker.connect()
         await scenario(bench)
         await bench.tracker.close()
@@ -66,7 +73,7 @@ def test_identity() -> None:
     async def main() -> Identity:
         return await Bench().tracker.connect()
 
-    assert run_virtual(main) == Identity("tracker", "Leica", "SIM TS60", "366001", "")
+    assert run_virtual(main) == Identity("tracker", "Leica", "SIM TS60", "366001", "1.0.0")
 
 
 @pytest.mark.parametrize("name", list(POINTS))
@@ -90,7 +97,7 @@ def test_the_sequence_on_the_wire() -> None:
         seen = bench.on_the_wire()
         await bench.tracker.measure("N1", NEAR["N1"], 2)
         requests = [line for line in seen if line.startswith(b"%R1Q")]
-        assert [int(line.split(b",")[1]) for line in requests] == [2008, 9027, 9037, 2008, 2108, 2108]
+        assert [int(line.split(b",")[1]) for line in requests] == [2008, 9027, 9037, 2008, 2108, 2167]
         trids = [int(line.split(b":")[0].split(b",")[2]) for line in requests]
         assert trids == list(range(trids[0], trids[0] + 6))
         hz, v = (float(p) for p in requests[1].split(b":")[1].split(b",")[:2])
@@ -112,7 +119,7 @@ def test_the_checksum_form_works_and_refuses_a_wrong_one() -> None:
         bench.station.faults.bad_crc = True
         with pytest.raises(DeviceSilent):
             await bench.tracker.measure("N2", NEAR["N2"])
-        assert bench.tracker.bad_lines == 1
+        assert bench.tracker.line.bad_lines == 1
 
     on_bench(scenario, checksum=True)
 
@@ -196,7 +203,7 @@ def test_a_late_reply_is_counted_and_never_taken_for_the_next() -> None:
         bench.station.faults.late_s = 0.0
         reading = await bench.tracker.measure("N2", NEAR["N2"])
         np.testing.assert_allclose(reading.p_T_mm, POINTS["N2"], atol=1e-6)
-        assert bench.tracker.stale_replies == 1
+        assert bench.tracker.line.stale_replies == 1
 
     on_bench(scenario)
 
@@ -273,28 +280,24 @@ def test_one_face_only() -> None:
     on_bench(scenario, two_face=False)
 
 
-@pytest.mark.parametrize("which", [0, 1])
-def test_no_single_bit_flip_gives_a_wrong_point(which: int) -> None:
+@pytest.mark.parametrize("commas", [5, 10], ids=["GetSimpleMea", "GetFullMeas"])
+def test_no_single_bit_flip_gives_a_wrong_point(commas: int) -> None:
     """Every bit of one of the two replies, flipped: refused, or still the point within three sigma."""
 
     async def scenario(bench: Bench) -> None:
         bench.optics.measure_s = 0.0
         await bench.tracker.measure("N1", NEAR["N1"])
-        send, state = bench.wire.to_host.send, {"bit": 0, "reply": 0, "length": 1}
+        send, state = bench.wire.to_host.send, {"bit": 0, "length": 1}
 
         def flip(data: bytes) -> None:
-            if data.count(b",") == 5:
-                if state["reply"] == which:
-                    state["length"] = len(data)
-                    at, bit = divmod(state["bit"], 8)
-                    data = data[:at] + bytes([data[at] ^ 1 << bit]) + data[at + 1 :]
-                state["reply"] += 1
+            if data.count(b",") == commas:
+                state["length"] = len(data)
+                data = flipped(data, state["bit"])
             send(data)
 
         bench.wire.to_host.send = flip  # type: ignore[method-assign]
         taken = refused = 0
         while state["bit"] < 8 * state["length"]:
-            state["reply"] = 0
             # Each time another target, so that a frozen sensor is not the reason for a refusal.
             name = ("N1", "N2")[state["bit"] % 2]
             try:
@@ -310,3 +313,134 @@ def test_no_single_bit_flip_gives_a_wrong_point(which: int) -> None:
         assert taken > 50  # the last digits of a number may differ by less than the noise
 
     on_bench(scenario, measure_timeout_s=3.0)
+
+
+def test_the_instruments_own_sigma_widens_the_model_across_the_line_of_sight() -> None:
+    async def scenario(bench: Bench) -> None:
+        bench.station.faults.sigma_angle_rad = 1e-4
+        reading = await bench.tracker.measure("N3", NEAR["N3"])
+        distance_mm = float(np.linalg.norm(POINTS["N3"]))
+        model = covariance(reading.p_T_mm)
+        # N3 lies to the north: the line of sight is y, across it are x and z.
+        assert reading.cov_mm2[1, 1] == pytest.approx(model[1, 1], rel=1e-3)
+        more_mm2 = (1e-4 * distance_mm) ** 2 - 0.5 * (model[0, 0] + model[2, 2])
+        assert reading.cov_mm2[0, 0] == pytest.approx(model[0, 0] + more_mm2, rel=1e-3)
+        assert reading.cov_mm2[2, 2] == pytest.approx(model[2, 2] + more_mm2, rel=1e-3)
+        bench.station.faults.sigma_angle_rad = 0.02
+        with pytest.raises(BadReply, match="accuracy of the angles"):
+            await bench.tracker.measure("N1", NEAR["N1"])
+
+    on_bench(scenario)
+
+
+def test_the_distance_of_the_point_before_is_refused_by_its_time() -> None:
+    async def scenario(bench: Bench) -> None:
+        await bench.tracker.measure("N1", NEAR["N1"])
+        bench.station.faults.stale_distance = True
+        with pytest.raises(BadReply, match="point before"):
+            await bench.tracker.measure("N2", NEAR["N2"])
+        bench.station.faults.stale_distance = False
+        np.testing.assert_allclose((await bench.tracker.measure("N2", NEAR["N2"])).p_T_mm, POINTS["N2"], atol=1e-6)
+
+    on_bench(scenario)
+
+
+def test_an_older_firmware_is_read_twice_by_the_simple_procedure() -> None:
+    async def scenario(bench: Bench) -> None:
+        bench.station.faults.missing = {2167}
+        seen = bench.on_the_wire()
+        for name in ("N1", "N2"):
+            np.testing.assert_allclose((await bench.tracker.measure(name, NEAR[name])).p_T_mm, POINTS[name], atol=1e-6)
+        asked = [int(line.split(b",")[1]) for line in seen if line.startswith(b"%R1Q")]
+        assert asked.count(2167) == 1
+        assert asked.count(2108) == 4
+
+    on_bench(scenario)
+
+
+AIR = {"pressure_hpa": 980.0, "dry_c": 24.0, "wet_c": 17.5}
+
+
+def test_prism_and_air_are_written_and_correct_the_distance() -> None:
+    async def scenario(bench: Bench) -> None:
+        head = bench.station.head
+        assert (head.prism_mm, head.air) == (pytest.approx(-16.9), Air(980.0, 24.0, 17.5))
+        # 12 K warmer and 33 hPa less than the reference air, at about 1 ppm a K and 0.28 ppm a hPa.
+        assert head.air.ppm() == pytest.approx(21.0, abs=0.5)
+        head.true_prism_mm, head.true_air = -16.9, Air(980.0, 24.0, 17.5)
+        np.testing.assert_allclose((await bench.tracker.measure("N3", NEAR["N3"])).p_T_mm, POINTS["N3"], atol=1e-6)
+        head.true_prism_mm = 0.0
+        short = (await bench.tracker.measure("N3", NEAR["N3"])).p_T_mm
+        assert np.linalg.norm(short) - np.linalg.norm(POINTS["N3"]) == pytest.approx(-16.9, abs=1e-6)
+
+    on_bench(scenario, geocom={"prism_mm": -16.9, "air": AIR})
+
+
+@pytest.mark.parametrize(
+    ("settings", "lie", "words"),
+    [
+        ({"prism_mm": -34.4}, lambda station: station.faults.ignores.add(2024), "prism constant"),
+        ({"air": AIR}, lambda station: station.faults.ignores.add(2028), "pressure"),
+        ({}, lambda station: station._procedures.update({108: lambda params: (0, ("4",))}), "decimals"),
+    ],
+)
+def test_an_instrument_that_keeps_another_setting_is_refused(
+    settings: dict[str, Any], lie: Callable[[GeocomStation], None], words: str
+) -> None:
+    async def main() -> None:
+        bench = Bench(geocom=settings)
+        lie(bench.station)
+        with pytest.raises(ReadBackMismatch, match=words):
+            await bench.tracker.connect()
+
+    run_virtual(main)
+
+
+def test_a_reflector_outside_the_fine_window_is_searched_where_that_is_allowed() -> None:
+    aside = NEAR["N3"] + np.array([400.0, 0.0, 250.0])  # 2.5 and 1.6 deg off
+
+    async def narrow(bench: Bench) -> None:
+        with pytest.raises(TargetLost, match="8710"):
+            await bench.tracker.measure("N3", aside)
+
+    async def wide(bench: Bench) -> None:
+        np.testing.assert_allclose((await bench.tracker.measure("N3", aside)).p_T_mm, POINTS["N3"], atol=1e-6)
+        with pytest.raises(TargetLost):
+            await bench.tracker.measure("N3", -NEAR["N3"])
+
+    on_bench(narrow)
+    on_bench(wide, geocom={"search_deg": 8.0})
+
+
+def test_a_measurement_that_is_given_up_stops_the_motors() -> None:
+    async def scenario(bench: Bench) -> None:
+        bench.station.faults.turn_s = 5.0
+        task = asyncio.ensure_future(bench.tracker.measure("N1", NEAR["N1"]))
+        await asyncio.sleep(1.0)
+        assert bench.station._turning is not None
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        await asyncio.sleep(0.1)
+        assert bench.station._turning is None
+        bench.station.faults.turn_s = 0.5
+        np.testing.assert_allclose((await bench.tracker.measure("N2", NEAR["N2"])).p_T_mm, POINTS["N2"], atol=1e-6)
+        assert (bench.tracker.line.bad_lines, bench.tracker.line.noise_bytes) == (0, 0)
+        assert bench.tracker.line.stale_replies == 1  # "aborted", under the number of the call that was given up
+
+    on_bench(scenario)
+
+
+def test_garbage_between_replies_costs_nothing_and_a_flood_ends_the_request() -> None:
+    async def scenario(bench: Bench) -> None:
+        bench.station.faults.garbage_bytes = 40
+        for name in POINTS:
+            np.testing.assert_allclose((await bench.tracker.measure(name, NEAR[name])).p_T_mm, POINTS[name], atol=1e-6)
+        assert bench.tracker.line.noise_bytes > 0
+        bench.station.faults.garbage_bytes = 0
+        task = asyncio.ensure_future(bench.tracker.measure("N1", NEAR["N1"]))
+        await asyncio.sleep(0.5)
+        bench.wire.far.write(b"%R1P,broken\r\n" * 6)
+        with pytest.raises(BadReply, match="6 bad lines"):
+            await task
+
+    on_bench(scenario)
