@@ -102,6 +102,32 @@ def largest_clique(adj: list[int], allowed: int | None = None, at_least: int = 0
     return found if found.bit_count() >= at_least else 0
 
 
+def maximal_cliques(adj: list[int], at_least: int, most: int) -> list[int]:
+    """Masks of the cliques of `at_least` vertices or more that no vertex can join; `most` of them at the most.
+
+    Bron-Kerbosch with a pivot: only vertices that the pivot does not see are branched on.
+    """
+    found: list[int] = []
+    nodes = _NODES
+
+    def expand(clique: int, candidates: int, done: int) -> None:
+        nonlocal nodes
+        nodes -= 1
+        if not candidates and not done:
+            found.append(clique)
+            return
+        pivot = max(bits(candidates | done), key=lambda i: (adj[i] & candidates).bit_count())
+        for v in bits(candidates & ~adj[pivot]):
+            inside = candidates & adj[v]
+            if clique.bit_count() + 1 + inside.bit_count() >= at_least and len(found) < most and nodes > 0:
+                expand(clique | 1 << v, inside, done & adj[v])
+            candidates &= ~(1 << v)
+            done |= 1 << v
+
+    expand(0, (1 << len(adj)) - 1, 0)
+    return found
+
+
 def rival_clique(adj: list[int], chosen: int, size: int) -> int:
     """Mask of a clique of at least `size` that shares at most two points with `chosen`; 0 when there is none.
 

@@ -12,7 +12,7 @@ from docking.pose.quantiles import normal_upper
 from docking.pose.settings import FitSettings
 from docking.types import Array
 
-_UNIT_FACTORS = (1000.0, 100.0, 10.0, 25.4, 2.54, 304.8, 0.3048, 12.0)
+UNIT_FACTORS = (1000.0, 100.0, 10.0, 25.4, 2.54, 304.8, 0.3048, 12.0)
 """Ratios that one file in another unit produces: m, cm, inch and foot against mm, and against each other."""
 _SMALL_SAMPLE = {3: 0.27, 4: 0.60, 5: 0.47, 6: 0.62, 7: 0.54}
 """Repeated median of |difference| over sqrt(2) sigma for few points (Monte Carlo); 0.63 from 8 points on."""
@@ -88,7 +88,7 @@ def check_units(nominal_mm: Array, measured_mm: Array, settings: FitSettings) ->
     if not bool(upper.any()):
         return
     ratio = float(np.median(d_p[upper] / d_j[upper]))
-    for factor in _UNIT_FACTORS:
+    for factor in UNIT_FACTORS:
         for f in (factor, 1.0 / factor):
             if abs(ratio / f - 1.0) < 0.02:
                 raise UnitMixUp(settings.where, f"a factor of {f:.6g} points to two different units", value=ratio)

@@ -29,3 +29,8 @@ def fisher_upper(probability: float, dof: int, dof_below: Array) -> Array:
     """Values that F with `dof` over `dof_below` (n,) degrees of freedom exceeds with this probability (n,)."""
     result: Array = special.fdtri(dof, dof_below, 1.0 - probability)
     return result
+
+
+def chi2_tail(value: float, dof: int) -> float:
+    """Probability that chi-square with `dof` degrees of freedom exceeds `value`; 1 without degrees of freedom."""
+    return float(special.chdtrc(dof, value)) if dof > 0 else 1.0

@@ -7,21 +7,31 @@ the fit settles the borderline. The tolerance comes from the covariances; where 
 
 from __future__ import annotations
 
+from math import comb
 from typing import NamedTuple
 
 import numpy as np
 
-from docking.errors import AmbiguousSet, NotCongruent, PoseError, TooFewPoints
-from docking.pose.clique import adjacency, bits, largest_clique, rival_clique
-from docking.pose.layout import MIN_POINTS, check_layout
+from docking.errors import AmbiguousSet, ComponentDeformed, NoRedundancy, NotCongruent, PoseError, TooFewPoints
+from docking.pose.clique import adjacency, bits, largest_clique, maximal_cliques, rival_clique
+from docking.pose.deformation import deformation
+from docking.pose.layout import MIN_POINTS, check_layout, spread
 from docking.pose.pairs import check_units, distances, estimated_sigma_mm, estimated_tolerance_mm, pair_tolerance_mm
 from docking.pose.passes import Averaged, average_passes
+from docking.pose.quantiles import chi2_tail
+from docking.pose.reasons import Reasons, explain
 from docking.pose.settings import FitSettings
 from docking.pose.snooping import Pairs, Tested, residuals_mm, snoop
 from docking.pose.svd import fit_svd, mirrored_rms_mm
 from docking.types import Array, Points, Rejection, Screened
 
 _SHRINKS = 6
+_RIVALS, _RIVALS_UP_TO = 40, 64
+"""Sets that compete for the explanation, and the largest graph in which they are looked for."""
+_PLAUSIBLE = 0.002
+"""A rival whose chi-square is less probable than this is an accident of its few distances."""
+_ACCIDENTS = 0.3
+"""A minority is believed when fewer sets of its size than this are to be expected by chance."""
 _SMALLEST_SIGMA_MM = 1e-4
 """Estimated sigmas do not fall below this: noiseless files still carry rounding."""
 
@@ -80,27 +90,28 @@ def _screen_pairs(pairs: Pairs, averaged: Averaged, settings: FitSettings) -> Sc
     check_layout(pairs.nominal_mm, settings)
     check_units(pairs.nominal_mm, pairs.measured_mm, settings)
     graph = _consistency(pairs, settings)
-    if not (len(graph.clique) >= settings.min_agreeing):
+    if not (len(graph.clique) >= min(settings.min_agreeing, MIN_POINTS)):
         raise _not_congruent(pairs, graph, settings)
     check_layout(pairs.nominal_mm[graph.clique], settings)
     _check_mirror(pairs.rows(graph.clique), graph, settings)
     scaled, given = graph.sigma_mm is not None, pairs
     pairs = given if graph.sigma_mm is None else _with_sigma(given, graph.sigma_mm)
-    tested = snoop(pairs, graph.clique, settings.false_alarm, settings.expansion_sigma, scaled)
-    _check_unique(pairs, graph, tested, settings)
+    tested = _best(pairs, graph, settings)
     if scaled:
         pairs = _with_sigma(given, _posterior_sigma_mm(pairs, tested))
+    inside = set(tested.kept)
+    out = [i for i in range(len(pairs.names)) if i not in inside]
+    why = explain(pairs, tested.solution.X_MN, out, graph.tolerance_mm)
+    _check_deformed(pairs, tested, why, settings)
+    _check_believable(graph, tested, why, settings)
     kept = pairs.rows(tested.kept)
-    out = [_explain(pairs, tested, i) for i in range(len(pairs.names)) if i not in set(tested.kept)]
-    _check_deformed(out, graph, tested, settings)
-    rejected = (*out, *averaged.rejected)
     return Screened(
         kept.names,
         kept.nominal_mm,
         kept.nominal_cov_mm2,
         kept.measured_mm,
         kept.measured_cov_mm2,
-        rejected,
+        (*why.rejected, *averaged.rejected),
         tuple(averaged.dropped),
     )
 
@@ -194,54 +205,91 @@ def _check_mirror(pairs: Pairs, graph: _Graph, settings: FitSettings) -> None:
         raise NotCongruent(settings.where, cause, value=0, limit=settings.min_agreeing)
 
 
-def _check_unique(pairs: Pairs, graph: _Graph, tested: Tested, settings: FitSettings) -> None:
-    """Refuse when other points, with at most two of the kept ones, agree among themselves just as many."""
-    kept = sum(1 << i for i in tested.kept)
-    rival = bits(rival_clique(graph.adj, kept, len(graph.clique)))
-    if rival:
-        first, second = (", ".join(pairs.names[i] for i in rows[:8]) for rows in (graph.clique, rival))
-        raise AmbiguousSet(settings.where, f"{first} agree among themselves, and so do {second}", value=len(rival))
+def _best(pairs: Pairs, graph: _Graph, settings: FitSettings) -> Tested:
+    """The consistent set that explains the points best, snooped. Raises AmbiguousSet where another does nearly so.
 
-
-def _check_deformed(out: list[Rejection], graph: _Graph, tested: Tested, settings: FitSettings) -> None:
-    """Refuse when points would have to be deleted until the rest fits: most of them, or one after another.
-
-    A swapped or misplaced reflector is explained by the fit itself and does not count against it.
+    All cliques of the largest size and one below it compete; in a large graph the largest only.
     """
-    unexplained = sum(r.reason == "mis-aimed" for r in out)
-    if not (unexplained <= len(tested.kept)):
-        cause = f"{unexplained} points are off without a pattern: another or a deformed part, or sigmas too small"
-        error = NotCongruent(settings.where, cause, value=len(tested.kept), limit=unexplained)
-        error.rejected = tuple(out)
+    n, scaled = len(pairs.names), graph.sigma_mm is not None
+    cliques = [graph.clique]
+    if len(graph.clique) < n <= _RIVALS_UP_TO:
+        least = max(len(graph.clique) - 1, MIN_POINTS)
+        cliques += [c for c in map(bits, maximal_cliques(graph.adj, least, _RIVALS)) if c != graph.clique]
+    found: dict[tuple[int, ...], Tested] = {}
+    for clique in cliques:
+        if clique is graph.clique or spread(pairs.nominal_mm[clique]).middle_mm > _least_middle_mm(pairs):
+            tested = snoop(pairs, clique, settings, scaled)
+            found.setdefault(tuple(tested.kept), tested)
+    best, *others = sorted(found.values(), key=lambda t: t.cost)
+    kept = set(best.kept)
+    rivals = [t.kept for t in others if len(kept) <= len(t.kept) and len(kept & set(t.kept)) < MIN_POINTS and _holds(t)]
+    if n > _RIVALS_UP_TO:
+        rival = bits(rival_clique(graph.adj, sum(1 << i for i in best.kept), len(graph.clique)))
+        rivals = [rival] if rival else []
+    if rivals:
+        first, second = (", ".join(pairs.names[i] for i in rows[:8]) for rows in (best.kept, rivals[0]))
+        cause = f"{first} agree among themselves, and so do {second}"
+        raise AmbiguousSet(settings.where, cause, value=len(rivals[0]))
+    return best
+
+
+def _holds(tested: Tested) -> bool:
+    """Global test: the set's own residuals are no larger than its covariances say."""
+    return chi2_tail(tested.chi2, 3 * len(tested.kept) - 6) >= _PLAUSIBLE
+
+
+def _least_middle_mm(pairs: Pairs) -> float:
+    """A set of points narrower than this across its longest direction has no say: it would turn freely about it."""
+    return 0.02 * spread(pairs.nominal_mm).long_mm
+
+
+def _check_deformed(pairs: Pairs, tested: Tested, why: Reasons, settings: FitSettings) -> None:
+    """Refuse a part whose points follow a smooth shape. Swapped, misplaced or misread points have nothing to say."""
+    found = deformation(pairs, tested, why.moved, why.events, settings.expansion_sigma)
+    if found is not None:
+        error = ComponentDeformed(settings.where, found.shape, value=found.largest_mm, limit=found.noise_mm)
+        error.rejected = why.rejected
         raise error
-    allowed = max(1, len(graph.clique) // 4)
-    if not (tested.snooped <= allowed):
+
+
+def _check_believable(graph: _Graph, tested: Tested, why: Reasons, settings: FitSettings) -> None:
+    """Refuse a set that chance could bring together, a minority where that is asked, and points put out one by one."""
+    kept, n = len(tested.kept), len(graph.adj)
+    chance = _accidental(graph, tested.kept)
+    unexplained = len(why.moved)
+    error = None
+    if 2 * kept <= n and not (chance <= _ACCIDENTS):
+        cause = f"so many agree by chance: {chance:.2g} such sets are to be expected; another part, or sigmas too small"
+        error = NotCongruent(settings.where, cause, value=kept, limit=min(kept + 1, n))
+    elif settings.majority and not (unexplained <= kept):
+        cause = f"{unexplained} points are off without a pattern: another or a deformed part, or sigmas too small"
+        error = NotCongruent(settings.where, cause, value=kept, limit=unexplained)
+    elif not (tested.snooped <= max(1, len(graph.clique) // 4)):
         cause = f"{tested.snooped} points would have to go until the rest fits: deformed part, or sigmas too small"
-        raise NotCongruent(settings.where, cause, value=len(tested.kept), limit=len(graph.clique) - allowed)
+        error = NotCongruent(settings.where, cause, value=kept, limit=kept + tested.snooped)
+    elif not (kept >= settings.min_agreeing):
+        error = NoRedundancy(settings.where, value=kept, limit=settings.min_agreeing)
+    if error is not None:
+        error.rejected = why.rejected
+        raise error
+
+
+def _accidental(graph: _Graph, kept: list[int]) -> float:
+    """How many sets as large as the kept one would agree if pairs agreed at the rate of the pairs outside of it."""
+    n, m = len(graph.adj), len(kept)
+    inside = sum(1 << i for i in kept)
+    pairs = (n * (n - 1) - m * (m - 1)) // 2
+    if pairs == 0:
+        return 0.0
+    edges = sum(a.bit_count() for a in graph.adj) - sum((graph.adj[i] & inside).bit_count() for i in kept)
+    rate = (0.5 * edges + 0.5) / (pairs + 1.0)
+    return float(comb(n, m) * rate ** (m * (m - 1) // 2))
 
 
 def _posterior_sigma_mm(pairs: Pairs, tested: Tested) -> float:
     """sqrt(sum |r|^2 / (3 n - 6)) of the kept points."""
     r = residuals_mm(pairs.rows(tested.kept), tested.solution)
     return max(float(np.sqrt(np.sum(r * r) / max(3 * len(r) - 6, 1))), _SMALLEST_SIGMA_MM)
-
-
-# What was wrong with a point -------------------------------------------------------------------------------------
-def _explain(pairs: Pairs, tested: Tested, i: int) -> Rejection:
-    """Name what happened to a rejected point: `swapped`, `wrong-nest` or `mis-aimed`."""
-    places = tested.solution.X_MN.apply(pairs.nominal_mm)
-    off = float(np.linalg.norm(pairs.measured_mm[i] - places[i]))
-    gap = np.linalg.norm(places - pairs.measured_mm[i], axis=1)
-    gap[i] = np.inf
-    j = int(np.argmin(gap))
-    reach = 4.0 * float(np.sqrt(np.max(np.trace(pairs.measured_cov_mm2 + pairs.nominal_cov_mm2, axis1=1, axis2=2))))
-    if gap[j] <= min(reach, 0.2 * off):
-        if float(np.linalg.norm(pairs.measured_mm[j] - places[i])) <= min(reach, 0.2 * off):
-            return Rejection(pairs.names[i], "swapped", f"swapped with {pairs.names[j]}")
-        return Rejection(
-            pairs.names[i], "wrong-nest", f"measured where {pairs.names[j]} should be, {off:.3f} mm from its place"
-        )
-    return Rejection(pairs.names[i], "mis-aimed", f"{off:.3f} mm from where the other points put it")
 
 
 def _named(rejected: list[Rejection]) -> str:

@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 from docking.pose.least_squares import Solution, design, fit_maximum_likelihood
 from docking.pose.quantiles import chi2_upper, fisher_upper
+from docking.pose.settings import FitSettings
 from docking.pose.svd import fit_svd
 from docking.pose.uncertainty import total_cov_mm2
 from docking.types import Array
 
 _ROUNDS = 40
-_LEAST = 4
-"""No point is snooped away when fewer than this many would remain: nothing would be left to prove it wrong."""
 
 
 class Pairs(NamedTuple):
@@ -45,12 +44,16 @@ class Pairs(NamedTuple):
 
 
 class Tested(NamedTuple):
-    """Outcome of the snooping: rows kept, the pose they define, statistic over its threshold a point (n,)."""
+    """Outcome of the snooping: rows kept, the pose they define, statistic over its threshold a point (n,), how many
+    points the test put out, chi-square of the kept ones, and the cost of it all: chi-square and the threshold of the
+    test for each of the others."""
 
     kept: list[int]
     solution: Solution
     ratio: Array
     snooped: int
+    chi2: float
+    cost: float
 
 
 def solve(pairs: Pairs, expansion_sigma: float) -> Solution:
@@ -111,23 +114,34 @@ def _weighted_squares(pairs: Pairs, kept: list[int]) -> Array:
     return result
 
 
-def snoop(pairs: Pairs, kept: list[int], false_alarm: float, expansion_sigma: float, scaled: bool) -> Tested:
+def snoop(pairs: Pairs, kept: list[int], settings: FitSettings, scaled: bool) -> Tested:
     """Move points in or out of the kept set, the clearest case first, until all agree with the test.
 
-    `scaled`: the covariances are known up to a factor only. A point once put out by the test stays out.
+    `scaled`: the covariances are known up to a factor only. A point once put out by the test stays out, and no point is
+    put out when fewer than `settings.min_agreeing` would remain.
     """
     kept, banned = sorted(kept), set[int]()
     for _ in range(_ROUNDS):
-        solution = solve(pairs.rows(kept), expansion_sigma)
-        ratio = _ratio(pairs, kept, _statistics(pairs, solution, kept), false_alarm, scaled)
+        solution = solve(pairs.rows(kept), settings.expansion_sigma)
+        ratio = _ratio(pairs, kept, _statistics(pairs, solution, kept), settings.false_alarm, scaled)
         worst = max(kept, key=lambda i: ratio[i])
         outside = [i for i in range(len(ratio)) if i not in kept and i not in banned]
         nearest = min(outside, key=lambda i: ratio[i], default=None)
-        if ratio[worst] > 1.0 and len(kept) > _LEAST:
+        if ratio[worst] > 1.0 and len(kept) > settings.min_agreeing:
             kept.remove(worst)
             banned.add(worst)
         elif nearest is not None and ratio[nearest] <= 1.0:
             kept = sorted([*kept, nearest])
         else:
             break
-    return Tested(kept, solution, ratio, len(banned))
+    chi2 = chi_square(pairs.rows(kept), solution)
+    left = len(pairs.names) - len(kept)
+    cost = chi2 + (left * chi2_upper(settings.false_alarm / len(pairs.names), 3) if left else 0.0)
+    return Tested(kept, solution, ratio, len(banned), chi2, cost)
+
+
+def chi_square(pairs: Pairs, solution: Solution) -> float:
+    """Sum of r^T S^-1 r of all the pairs."""
+    r = residuals_mm(pairs, solution)
+    s = total_cov_mm2(pairs.nominal_cov_mm2, pairs.measured_cov_mm2, solution.X_MN.R)
+    return float(np.vdot(r, np.linalg.solve(s, r[:, :, None])[:, :, 0]))
