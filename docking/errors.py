@@ -18,7 +18,7 @@ from functools import cache
 from importlib import resources
 from typing import ClassVar
 
-from docking.types import Alarm, Rejection
+from docking.types import Alarm, Rejection, StopTimes
 
 Quantity = float | int | str | None
 
@@ -56,9 +56,10 @@ class DockingError(Exception):
         """What to do about it."""
         return catalogue(language)[str(self.code)]["remedy"]
 
-    def alarm(self, t_s: float = float("nan"), language: str = "en") -> Alarm:
-        """The same facts as a noun for the journal, the report and the JSON output."""
-        return Alarm(self.code, self.text(language), self.where, self.value, self.limit, self.remedy(language), t_s)
+    def alarm(self, t_s: float = float("nan"), language: str = "en", stop: StopTimes | None = None) -> Alarm:
+        """The same facts as a noun for the journal, the report and the JSON output, with the stop that it led to."""
+        text, remedy = self.text(language), self.remedy(language)
+        return Alarm(self.code, text, self.where, self.value, self.limit, remedy, t_s, stop)
 
 
 # 1xxx wires and devices ------------------------------------------------------------------------------------------
@@ -217,6 +218,26 @@ class NotRelieved(MotionError):
 
 class ForeignForce(MotionError):
     code = 2133
+
+
+class AxisUnreferenced(MotionError):
+    code = 2134
+
+
+class EmergencyStop(MotionError):
+    code = 2141
+
+
+class ProtectiveStop(MotionError):
+    code = 2142
+
+
+class PermissiveLost(MotionError):
+    code = 2143
+
+
+class BrakeDisagrees(MotionError):
+    code = 2144
 
 
 # 3xxx measuring and fitting --------------------------------------------------------------------------------------

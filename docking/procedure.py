@@ -33,7 +33,7 @@ from docking.motion.weighing import weigh
 from docking.planning import Action, GuardSettings, PlanRequest, PlanSettings, check_correction, make_plan, retreat_plan
 from docking.ports import Journal, Motion, Operator
 from docking.pose import fit_pose, screen
-from docking.progress import Progress
+from docking.progress import Progress, stop_of
 from docking.state import Effect, Event
 from docking.survey import Survey
 from docking.types import Array, Fit, Plan, Pose
@@ -98,7 +98,7 @@ class Procedure:
 
     def alarm(self, error: DockingError) -> None:
         """Keep an error in the journal and tell the operator."""
-        alarm = error.alarm(self._survey.clock())
+        alarm = error.alarm(self._survey.clock(), stop=stop_of(self.progress.result, error))
         self.progress.alarms.append(alarm)
         self.journal.write("alarm", records.alarm_record(alarm))
         self.operator.notify("alarm", code=alarm.code, error=error)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from docking.planning import Attempt
-from docking.types import Alarm, Array, FeatureErrors, Fit, MoveResult, Plan
+from docking.types import Alarm, Array, FeatureErrors, Fit, MoveResult, Plan, StopTimes
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,11 +39,12 @@ class Progress:
     rejected: set[str] = field(default_factory=set)
     max_residual_mm: float = 0.0
     max_internal_force_n: float = 0.0
+    result: MoveResult | None = None
 
     def moved(self, plan: Plan, result: MoveResult) -> None:
         """Keep how a move ended. A move along the way is added to it; one back along it is taken off, and leaves
         everything to be measured anew at the stage that it led back to."""
-        self.moves, self.passes = self.moves + 1, 0
+        self.moves, self.passes, self.result = self.moves + 1, 0, result
         self.commanded_mm = result.commanded_mm
         self.max_residual_mm = max(self.max_residual_mm, result.max_residual_mm)
         self.max_internal_force_n = max(self.max_internal_force_n, result.max_internal_force_n)
@@ -52,3 +53,8 @@ class Progress:
             return
         undone = self.way.pop()
         self.stage, self.corrections, self.history, self.X_WC = undone.stage, 0, [], None
+
+
+def stop_of(result: MoveResult | None, error: Exception) -> StopTimes | None:
+    """The times of the stop that `error` led to; None where it did not end the last move."""
+    return result.stop if result is not None and result.cause is error else None

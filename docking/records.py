@@ -9,7 +9,7 @@ import numpy as np
 
 from docking.geometry import pose_to_vector
 from docking.planning.relief import Strain, Weighing
-from docking.types import Alarm, Array, FeatureErrors, Fit, MoveResult, Plan, PlanBounds, Pose, Rejection
+from docking.types import Alarm, Array, FeatureErrors, Fit, MoveResult, Plan, PlanBounds, Pose, Rejection, StopTimes
 
 POSE_KEYS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
 
@@ -96,9 +96,6 @@ def bounds_record(axes: tuple[str, ...], bounds: PlanBounds) -> dict[str, Any]:
     def by_axis(values: Array) -> dict[str, float]:
         return dict(zip(axes, values.tolist(), strict=True))
 
-    def known(value: float) -> float | None:
-        return value if math.isfinite(value) else None
-
     return {
         "peak_mm_s": by_axis(bounds.peak_mm_s),
         "quick_stop_s": bounds.quick_stop_s,
@@ -108,9 +105,9 @@ def bounds_record(axes: tuple[str, ...], bounds: PlanBounds) -> dict[str, Any]:
         "residual_mm": bounds.residual_mm,
         "force_n": bounds.force_n,
         "warp_n": bounds.warp_n,
-        "clearance_mm": known(bounds.clearance_mm),
-        "clearance_asked_mm": known(bounds.clearance_asked_mm),
-        "clearance_s": known(bounds.clearance_s),
+        "clearance_mm": _known(bounds.clearance_mm),
+        "clearance_asked_mm": _known(bounds.clearance_asked_mm),
+        "clearance_s": _known(bounds.clearance_s),
         "duration_s": bounds.duration_s,
         "limits": [list(row) for row in bounds.limits],
     }
@@ -130,6 +127,7 @@ def moved_record(plan: Plan, result: MoveResult) -> dict[str, Any]:
         "plan_hash": plan.plan_hash,
         "result": result.result,
         "path_time_s": result.path_time_s,
+        "stop": stop_record(result.stop),
         "trace": {
             "t_s": trace.t_s.tolist(),
             "path_time_s": trace.path_time_s.tolist(),
@@ -175,5 +173,21 @@ def alarm_record(alarm: Alarm) -> dict[str, Any]:
         "value": alarm.value,
         "limit": alarm.limit,
         "remedy": alarm.remedy,
-        "t_s": alarm.t_s if math.isfinite(alarm.t_s) else None,
+        "t_s": _known(alarm.t_s),
+        "stop": stop_record(alarm.stop),
     }
+
+
+def stop_record(stop: StopTimes | None) -> dict[str, float | None] | None:
+    """When a stop was found necessary (loop time), and how long after that commands and axes followed."""
+    if stop is None:
+        return None
+    return {
+        "found_s": _known(stop.found_s),
+        "commanded_after_s": _known(stop.commanded_s - stop.found_s),
+        "rest_after_s": _known(stop.rest_s - stop.found_s),
+    }
+
+
+def _known(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -21,6 +21,7 @@ from docking.motion.weighing import weigh
 from docking.planning import PlanSettings
 from docking.planning.relief import ReliefSettings, Scales, StepRequest, Strain, Tare, Weighing, relief_plan
 from docking.ports import Journal, Motion, Operator
+from docking.progress import stop_of
 from docking.state import Effect, Event
 from docking.types import Alarm, Array, MoveResult, Plan
 
@@ -55,6 +56,7 @@ class ReliefProgress:
     weighing: Weighing | None = None
     plan: Plan | None = None
     commanded_mm: Array | None = None
+    result: MoveResult | None = None
     alarms: list[Alarm] = field(default_factory=list)
 
 
@@ -81,7 +83,7 @@ class Relief:
 
     def alarm(self, error: DockingError) -> None:
         """Keep an error in the journal and tell the operator."""
-        alarm = error.alarm(self._clock())
+        alarm = error.alarm(self._clock(), stop=stop_of(self.progress.result, error))
         self.progress.alarms.append(alarm)
         self.journal.write("alarm", records.alarm_record(alarm))
         self.operator.notify("alarm", code=alarm.code, error=error)
@@ -205,7 +207,7 @@ class Relief:
         self.journal.write("intent", records.intent_record(p.plan), durable=True)
         await self.motion.load(p.plan)
         result = await self._guarded(p.plan, p.strain)
-        p.steps, p.commanded_mm = p.steps + 1, result.commanded_mm
+        p.steps, p.commanded_mm, p.result = p.steps + 1, result.commanded_mm, result
         self.journal.write("moved", records.moved_record(p.plan, result))
         if result.cause is not None:
             raise result.cause

@@ -353,7 +353,8 @@ class Trace:
 class MoveResult:
     """How a move ended: `done`, `stopped` (on request, on the path) or `fault` (with its `cause`).
 
-    `path_time_s` is where on the plan it ended, `commanded_mm` (m,) the last commanded axis positions.
+    `path_time_s` is where on the plan it ended, `commanded_mm` (m,) the last commanded axis positions, `stop` the times
+    of the stop that ended it, None where the plan ran to its end.
     """
 
     result: str
@@ -374,6 +375,18 @@ class Alarm:
     message: str
     where: str = ""
     value: float | str | None = None
+@dataclass(frozen=True)
+class StopTimes:
+    """A stop in loop time: the finding or request that asked for it, the first command that differs for it, and when
+    the read-backs showed all axes at rest. NaN where that was not seen."""
+
+    found_s: float
+    commanded_s: float
+    rest_s: float
+
+
     limit: float | str | None = None
     remedy: str = ""
     t_s: float = field(default=float("nan"))
+    stop: StopTimes | None = None
+    stop: StopTimes | None = None

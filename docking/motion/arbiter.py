@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from enum import Enum
 
-from docking.errors import EventRefused, StopOverdue
+from docking.errors import AxisUnreferenced, BadArgument, EventRefused, StopOverdue
 from docking.motion.reactions import REACTIONS, REQUESTS, Mode, Reaction, document
 from docking.motion.triggers import Finding, Trigger
 
@@ -27,6 +27,15 @@ class Role(Enum):
     SUPERVISOR = "supervisor"
     ENGINEER = "engineer"
 
+    @staticmethod
+    def named(name: str) -> Role:
+        """The role of that name. Raises BadArgument."""
+        try:
+            return Role(name)
+        except ValueError:
+            roles = ", ".join(role.value for role in Role)
+            raise BadArgument("reset", "no such role", value=name, limit=roles) from None
+
 
 OPERATORS_OWN = frozenset({Trigger.LEASE_LOST, Trigger.PERMISSIVE_LOST, Trigger.PROTECTIVE_STOP, Trigger.TICK_LATE})
 """Causes outside drives and part: an operator may reset them, all others need a supervisor."""
@@ -42,6 +51,9 @@ LASTING = frozenset(
     }
 )
 """Causes that last as long as the command they are judged against; enabling anew commands every axis to where it is."""
+
+UNREFERENCING = frozenset({Trigger.ENCODER_JUMP, Trigger.NODE_RESTARTED})
+"""Causes after which the position of the axis is not known until it has been referenced anew."""
 
 FINAL = frozenset({Trigger.DEFECT})
 """Causes after which this program is not to be trusted with axes until it has been started again."""
@@ -59,6 +71,7 @@ class Arbiter:
         self.reaction = Reaction.NONE
         self.first: Finding | None = None
         self.later: tuple[Finding, ...] = ()
+        self.unreferenced: tuple[str, ...] = ()
         self.rejected = 0
         self.on_latched: Callable[[], None] = lambda: None
         self._allowed_s = allowed_s
@@ -71,6 +84,12 @@ class Arbiter:
     def latched(self) -> bool:
         """True while a fault is kept: nothing may start."""
         return self.first is not None
+
+    def require_referenced(self) -> None:
+        """Before the axes are enabled. Raises AxisUnreferenced while no supervisor has acknowledged a new reference."""
+        if self.unreferenced:
+            cause = "" if self.first is None else self.first.error.text()
+            raise AxisUnreferenced(", ".join(self.unreferenced), cause)
 
     def enter(self, mode: Mode) -> None:
         """The motion side is now OFF, STANDING or MOVING. STOPPING is entered and left by reactions alone.
@@ -88,6 +107,9 @@ class Arbiter:
         if asked <= Reaction.REJ:
             self.rejected += 1
             return self.reaction
+        where = finding.error.where
+        if finding.trigger in UNREFERENCING and where not in self.unreferenced:
+            self.unreferenced = (*self.unreferenced, where)
         if finding.trigger not in REQUESTS:
             self._raised = self._raised or finding.trigger not in LASTING
             self._note(finding)
@@ -115,7 +137,7 @@ class Arbiter:
         reason = self.objection(role) or self._not_yet(held)
         if reason:
             raise EventRefused("reset", reason, value=f"reset by {role.value}")
-        self.reaction, self.first, self.later = Reaction.NONE, None, ()
+        self.reaction, self.first, self.later, self.unreferenced = Reaction.NONE, None, (), ()
 
     def objection(self, role: Role) -> str:
         """Why this role cannot reset what is kept, whatever becomes of the cause; empty where it can."""
@@ -125,6 +147,7 @@ class Arbiter:
             (not self.latched, "There is nothing to reset."),
             (self.reaction is Reaction.HW, "The hardware chain was opened: start the controller again."),
             (bool(causes & FINAL), "The program has an error: start the controller again."),
+            (not enough and bool(self.unreferenced), self._lost_reference()),
             (not enough, "This takes a supervisor."),
             (self.mode in (Mode.MOVING, Mode.STOPPING), "The axes are not at rest."),
         )
@@ -135,9 +158,16 @@ class Arbiter:
             return "The cause is still there."
         return "The key was held down: let it go, then press it again." if held else ""
 
+    def _lost_reference(self) -> str:
+        names = ", ".join(self.unreferenced)
+        return f"{names} lost its reference: a supervisor acknowledges by the reset that it was referenced anew."
+
     def _note(self, finding: Finding) -> None:
-        """Keep the first finding of each trigger."""
-        if self.first is None:
+        """Keep the first finding of each trigger. A drive that warned and is then in fault is one cause: its fault."""
+        if self.first is not None and _announced(self.first, finding):
+            self.first, self.later = finding, (*self.later, self.first)
+            self.on_latched()
+        elif self.first is None:
             self.first = finding
             self.on_latched()
         elif all(finding.trigger is not known.trigger for known in (self.first, *self.later)):
@@ -159,6 +189,12 @@ class Arbiter:
         led = self.reaction < Reaction.SQS
         trigger = Trigger.STOP_OVERDUE if led else Trigger.QUICK_STOP_OVERDUE
         return Finding(trigger, StopOverdue(name, value=taken_s, limit=self._limit_s))
+
+
+def _announced(first: Finding, finding: Finding) -> bool:
+    """Whether the first finding only announced this one."""
+    of = first.trigger, finding.trigger
+    return of == (Trigger.DRIVE_WARNING, Trigger.DRIVE_FAULT) and first.error.where == finding.error.where
 
 
 if __name__ == "__main__":

@@ -53,7 +53,8 @@ WORDS: dict[Reaction, tuple[str, str, str]] = {
     Reaction.SBT: (
         "stop, brakes, torque off",
         "1",
-        "Quick stop; at standstill the brakes close and are confirmed, then the torque goes off.",
+        "Quick stop; when the axes are seen at rest, at the latest when the ramp should be over, the brakes close and"
+        " are confirmed, then the torque goes off.",
     ),
     Reaction.HW: (
         "hardware chain",
@@ -85,12 +86,13 @@ _POWERED: dict[Trigger, tuple[Reaction, Reaction, Reaction]] = {
     Trigger.OVERLOAD: (_N, _F, _F),
     Trigger.UNDERLOAD: (_N, _F, _F),
     Trigger.STUCK: (_N, _F, _F),
-    Trigger.DRIFT: (_B, _S, _S),
+    Trigger.DRIFT: (_B, _B, _B),
     Trigger.LIMIT_SWITCH: (_N, _P, _P),
     Trigger.ENCODER_JUMP: (_S, _S, _S),
     Trigger.PASSIVE_AXIS: (_N, _F, _F),
     Trigger.FEEDBACK_MISSING: (_N, _F, _F),
-    Trigger.FORCE_MISSING: (_N, _P, _P),
+    Trigger.ALL_MISSING: (_S, _S, _S),
+    Trigger.FORCE_MISSING: (_N, _F, _F),
     Trigger.DRIVE_WARNING: (_N, _P, _P),
     Trigger.DRIVE_FAULT: (_S, _S, _S),
     Trigger.AXIS_OFF: (_S, _S, _S),
@@ -147,8 +149,35 @@ stop that has not ended 100 ms after its ramp opens the hardware chain. No axis 
 
 Every fault stays until it is reset: by a person who may, once the cause is gone, with a press that begins after that
 (a key that is held counts once). A reset never moves anything. The first cause is kept, later ones are listed behind
-it. After the hardware chain has been opened, and after an error of the program itself, the controller has to be
-started again.
+it; a drive that sends an emergency message and is in fault soon after is one cause, the fault. After the hardware chain
+has been opened, and after an error of the program itself, the controller has to be started again.
+
+An axis whose encoder jumped or whose node restarted has lost its reference: nothing is enabled until a supervisor has
+acknowledged, by the reset, that it was referenced anew.
+
+Before a move starts the load cells are judged: where they show a strained part, or another force than when the plan was
+loaded, the start is refused without any reaction; a held move whose forces change while it is held is not resumed.
+
+## Harder than a smooth stop, and why
+
+A smooth stop would do for a finding that strains nothing. These are answered harder:
+
+| trigger | reaction in motion | reason |
+|---|---|---|
+"""
+
+HARDER: dict[Trigger, str] = {
+    Trigger.FOLLOWING_ERROR: "may be the beginning of a jam, which must not wait for the slow ramp",
+    Trigger.FEEDBACK_MISSING: "an axis that is not seen may be a jammed one",
+    Trigger.STUCK: "every cycle that the others go on squeezes the part",
+    Trigger.COUPLING: "the part is being squeezed already",
+    Trigger.PASSIVE_AXIS: "a jammed guide or a ball out of its socket is a jam",
+    Trigger.FORCE_MISSING: "a load cell that shows nothing may be hiding an overload",
+    Trigger.LINK_LOST: "no drive can be reached, a refused frame included: only the drives' own watchdogs stop them",
+}
+"""Triggers that a path-preserving stop would answer, were they not what they may be."""
+
+_TABLE = """
 
 ## Triggers
 
@@ -166,4 +195,7 @@ def document() -> str:
         f"| {trigger.value} | " + " | ".join(REACTIONS[trigger, mode].name for mode in Mode) + " |\n"
         for trigger in Trigger
     )
-    return f"{_HEAD}{reactions}{_RULES}{modes} |\n|---|---|---|---|---|\n{rows}"
+    harder = "".join(
+        f"| {trigger.value} | {REACTIONS[trigger, Mode.MOVING].name} | {why} |\n" for trigger, why in HARDER.items()
+    )
+    return f"{_HEAD}{reactions}{_RULES}{harder}{_TABLE}{modes} |\n|---|---|---|---|---|\n{rows}"

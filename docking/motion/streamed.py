@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from docking.motion.monitors import Watch
 from docking.motion.playback import Playback
 from docking.motion.recorder import Recorder
 from docking.motion.standstill import Standstill
+from docking.motion.stop_clock import StopClock
 from docking.motion.stops import PlannedStop, planned_stop
 from docking.motion.triggers import Finding, Trigger
 from docking.ports import StreamedPositioners
@@ -43,19 +44,23 @@ STOP_CYCLES = 2
 QUICK_STOP_S = 0.1
 """By which a quick stop may outlast its ramp until all axes are seen at rest."""
 BRAKE_S = 2.0
+SEEN_S = 0.1
+"""So long after its last set-point a stop on the path is told even if the axes are not seen at rest."""
 RESET_S = 0.3
 """How long nothing may be found again after what the nodes reported has been forgotten: three heartbeats."""
 
 
 @dataclass
 class _Move:
-    """A running move."""
+    """A running move. `told_s`: when its last set-point was sent after a stop."""
 
     playback: Playback
     recorder: Recorder
     stop: PlannedStop
     done: asyncio.Future[MoveResult]
     over: asyncio.Event
+    clock: StopClock
+    told_s: float | None = None
 
 
 class StreamedMotion:
@@ -82,9 +87,11 @@ class StreamedMotion:
         self._applied = Reaction.NONE
         self._braking: asyncio.Task[None] | None = None
         self._braked = False
+        self._brake_due_s = 0.0
         self._standstill = Standstill()
         self._quick_stop_s = QUICK_STOP_S
         self._timer: asyncio.Handle | None = None
+        self._ticked = asyncio.Event()
         self._deadline_s = self._skipped_s = 0.0
 
     # the port ----------------------------------------------------------------------------------------------------
@@ -92,7 +99,8 @@ class StreamedMotion:
         return await self._bus.bring_up()
 
     async def enable(self) -> Array:
-        """Raises the fault that is kept: `reset` comes first."""
+        """Raises AxisUnreferenced, or the fault that is kept: `reset` comes first."""
+        self.arbiter.require_referenced()
         self._refuse()
         self._end_ticks()
         self.arbiter.enter(Mode.OFF)
@@ -109,7 +117,11 @@ class StreamedMotion:
         return self._setpoint
 
     async def load(self, plan: Plan) -> None:
-        """Take a plan, and set the drives' own ramps for it. Nothing moves."""
+        """Take a plan, and set the drives' own ramps for it. Nothing moves.
+
+        Refused where the part is strained already (MeasuredForceTrip, MeasuredWarpTrip, BallForceTrip, BallUnloaded);
+        a relief is the plan for that.
+        """
         self._refuse()
         gap = float(np.max(np.abs(plan.q_mm[0] - self._setpoint)[self._watch.driven]))
         if not (gap <= START_TOLERANCE_MM):
@@ -122,7 +134,9 @@ class StreamedMotion:
         # Axes without a set-point stand where the component has taken them: the plan begins there.
         self._setpoint = readonly(np.where(self._watch.driven, self._setpoint, plan.q_mm[0]))
         self._history.extend([self._setpoint] * 2)
+        await self._next_tick()
         self._watch.watch_about(plan.q_mm[0], relief=plan.kind == "relief")
+        self._require(self._watch.strained_before(self.feedback()))
         self._quick_stop_s = stop.longest_s + QUICK_STOP_S
         self._loaded = Playback(plan, self._share), stop
 
@@ -132,11 +146,12 @@ class StreamedMotion:
         if loaded is None or loaded[0].plan.plan_hash != plan_hash:
             raise PlanStale("motion", "this plan is not loaded")
         self._require_enabled()
+        self._require(self._watch.changed_at_rest(self.feedback()))
         playback, stop = loaded
         recorder = Recorder(self._watch, max(1, round(TRACE_PERIOD_S / self._cycle_s)))
         done: asyncio.Future[MoveResult] = asyncio.get_running_loop().create_future()
         self.arbiter.enter(Mode.MOVING)
-        self._move = _Move(playback, recorder, stop, done, asyncio.Event())
+        self._move = _Move(playback, recorder, stop, done, asyncio.Event(), StopClock())
         if self._early:
             playback.wait()
         for verb in self._early:
@@ -179,7 +194,7 @@ class StreamedMotion:
 
         Drives in fault are reset, too. Raises EventRefused with the reason, EnableFailed, LinkError.
         """
-        asked = Role(role)
+        asked = Role.named(role)
         objection = self.arbiter.objection(asked)
         if objection:
             raise EventRefused("reset", objection, value=f"reset by {role}")
@@ -222,15 +237,32 @@ class StreamedMotion:
         if self.arbiter.mode is not Mode.STANDING:
             raise PlanStale("motion", "the axes have to be enabled again")
 
+    @staticmethod
+    def _require(objection: Finding | None) -> None:
+        """Raise what forbids a start; nothing is kept, as the next start is judged anew."""
+        if objection is not None:
+            raise objection.error
+
     def _obey(self, move: _Move, verb: str) -> None:
         if verb == "stop":
             self._raise(Trigger.OPERATOR_STOP, StoppedByOperator("motion"))
         elif self.arbiter.mode is not Mode.MOVING:
             return
-        elif verb == "resume":
-            move.playback.resume()
-        else:
+        elif verb == "hold":
             move.playback.hold()
+        else:
+            changed = self._watch.changed_at_rest(self._feedback) if self._feedback is not None else None
+            if changed is None:
+                move.playback.resume()
+            else:
+                self._raise(changed.trigger, changed.error)
+
+    async def _next_tick(self) -> None:
+        """Wait until just after a tick: what takes a few milliseconds then makes no tick late."""
+        self._ticked.clear()
+        if self._timer is not None:
+            await self._ticked.wait()
+        self._refuse()
 
     def _end_ticks(self) -> None:
         if self._timer is not None:
@@ -250,6 +282,8 @@ class StreamedMotion:
             if move is not None and not move.done.done():
                 move.done.set_exception(error)
             raise
+        finally:
+            self._ticked.set()
 
     def _cycle(self) -> None:
         now_s = asyncio.get_running_loop().time()
@@ -265,27 +299,30 @@ class StreamedMotion:
         if not (late_s <= self._late_limit_s):
             self._raise(Trigger.TICK_LATE, TickLate("motion", value=late_s, limit=self._late_limit_s))
         stopping = self.arbiter.mode is Mode.STOPPING
+        if self._applied is Reaction.SBT and self._braking is None:
+            self._brake_at_rest(before, feedback)
         self._react(self.arbiter.poll(self._clock_s(), stopping and self._at_rest(before, feedback)))
         if self._applied is not Reaction.HW:
-            self._go_on(feedback, quick=self._applied >= Reaction.SQS > applied)
+            self._go_on(before, feedback, quick=self._applied >= Reaction.SQS > applied)
         if self._applied is Reaction.HW:
             self._finish("fault")
             return
         self._deadline_s += (1 + missed) * self._cycle_s
         self._timer = asyncio.get_running_loop().call_at(self._deadline_s, self._tick)
 
-    def _go_on(self, feedback: Feedback, *, quick: bool) -> None:
+    def _go_on(self, before: Feedback | None, feedback: Feedback, *, quick: bool) -> None:
         """Path time, set-points and SYNC; `quick` says that the quick stop has just sent this cycle's frames."""
         move = self._move
         if move is not None:
             move.recorder.add(feedback, move.playback.path_time_s)
             if self.arbiter.mode in (Mode.STANDING, Mode.OFF):
-                self._end_stop(move, feedback)
+                self._end_stop(move, before, feedback)
             elif self._applied < Reaction.SQS:
                 self._setpoint = move.playback.advance(self._cycle_s)
         self._history.append(self._setpoint)
         if not quick:
             self._send()
+        self._note_command()
         if self._move is not None and self.arbiter.mode is Mode.MOVING and self._move.playback.at_end:
             self._finish("done")
 
@@ -298,8 +335,19 @@ class StreamedMotion:
             # Set-points that a drive cannot take: nothing was sent, so the drives have to stop by themselves.
             self._raise(Trigger.DEFECT, error)
 
-    def _end_stop(self, move: _Move, feedback: Feedback) -> None:
-        """The axes have come to rest after a stop."""
+    def _note_command(self) -> None:
+        """What has been sent just now is the first that differs, if a stop has begun."""
+        if self._move is not None:
+            self._move.clock.commanded(asyncio.get_running_loop().time())
+
+    def _end_stop(self, move: _Move, before: Feedback | None, feedback: Feedback) -> None:
+        """The commands are at rest after a stop: end the move as soon as the axes are seen at rest, too."""
+        now_s = asyncio.get_running_loop().time()
+        move.told_s = now_s if move.told_s is None else move.told_s
+        if self._standstill.seen(before, feedback):
+            move.clock.rested(now_s)
+        elif now_s - move.told_s <= SEEN_S:
+            return
         if self._applied >= Reaction.SQS:
             self._setpoint = readonly(feedback.position_mm)
         if self.arbiter.latched:
@@ -339,7 +387,7 @@ class StreamedMotion:
     def _allowed_s(self, reaction: Reaction) -> float:
         """How long a reaction that begins now may take."""
         if reaction is Reaction.SBT:
-            return BRAKE_S
+            return self._quick_stop_s + BRAKE_S
         if reaction >= Reaction.SQS or self._move is None:
             return self._quick_stop_s
         playback = self._move.playback
@@ -348,21 +396,39 @@ class StreamedMotion:
 
     def _react(self, reaction: Reaction) -> None:
         """Begin the reaction in force, unless it has begun."""
+        if self._move is not None:
+            now_s = asyncio.get_running_loop().time()
+            self._move.clock.follow(self.arbiter.latched, reaction, now_s)
         if not (reaction > self._applied):
             return
         self._applied = reaction
+        self._standstill.begin()
         if reaction is Reaction.HW:
             self._bus.go_silent()
+            self._note_command()
         elif reaction >= Reaction.SQS:
-            self._standstill.begin()
             self._bus.quick_stop()
+            self._note_command()
             if reaction is Reaction.SBT:
-                self._braked = False
-                self._braking = asyncio.get_running_loop().create_task(self._brake())
+                self._begin_braking()
         elif self._move is not None and reaction is Reaction.FAST_PPS:
             self._move.playback.stop_straight(self._move.stop.fast_slew_per_s)
         elif self._move is not None and reaction is Reaction.PPS:
             self._move.playback.hold()
+
+    def _begin_braking(self) -> None:
+        """Brakes close on axes at rest: at once where none is led any more, else when all have come to rest."""
+        self._braked, self._braking = False, None
+        move, loop = self._move, asyncio.get_running_loop()
+        self._brake_due_s = loop.time() + self._quick_stop_s
+        if move is None or move.playback.standing:
+            self._braking = loop.create_task(self._brake())
+
+    def _brake_at_rest(self, before: Feedback | None, feedback: Feedback) -> None:
+        now_s = asyncio.get_running_loop().time()
+        # An axis that does not come to rest by itself is what a brake is for.
+        if self._standstill.seen(before, feedback) or now_s >= self._brake_due_s:
+            self._braking = asyncio.get_running_loop().create_task(self._brake())
 
     async def _brake(self) -> None:
         try:
@@ -386,7 +452,8 @@ class StreamedMotion:
         if move is None:
             return
         cause = self.arbiter.first.error if self.arbiter.first is not None else None
-        result = move.recorder.result(outcome, move.playback.path_time_s, self._setpoint, cause)
+        recorded = move.recorder.result(outcome, move.playback.path_time_s, self._setpoint, cause)
+        result = replace(recorded, stop=move.clock.times())
         self._end()
         if not move.done.done():
             move.done.set_result(result)

@@ -25,6 +25,7 @@ class Trigger(Enum):
     ENCODER_JUMP = "an encoder jumps"
     PASSIVE_AXIS = "a passive axis is not where the component takes it"
     FEEDBACK_MISSING = "an axis does not report"
+    ALL_MISSING = "no axis reports"
     FORCE_MISSING = "a load cell does not report"
     DRIVE_WARNING = "a drive sends an emergency message and goes on"
     DRIVE_FAULT = "a drive is in fault"

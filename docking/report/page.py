@@ -147,5 +147,18 @@ def alarm_rows(run: Run, language: str) -> list[dict[str, Any]]:
         body = record["body"]
         translated = catalogue(language).get(str(body.get("code")), {}).get("remedy")
         known = {key: body.get(key) for key in ("code", "message", "where", "value", "limit")}
-        rows.append({**known, "age_s": run.age_s(record), "remedy": translated or body.get("remedy")})
+        row = {**known, "age_s": run.age_s(record), "remedy": translated or body.get("remedy")}
+        rows.append({**row, "stop": _stop_row(run, body.get("stop"))})
     return rows
+
+
+def _stop_row(run: Run, stop: dict[str, Any] | None) -> dict[str, float | None] | None:
+    """The stop that an alarm led to: since the run's first record in s, then ms after the finding."""
+    if not stop or stop.get("found_s") is None:
+        return None
+
+    def later_ms(key: str) -> float | None:
+        return None if stop.get(key) is None else 1e3 * float(stop[key])
+
+    age_s = run.age_s({"t_mono_s": stop["found_s"]})
+    return {"age_s": age_s, "commanded_ms": later_ms("commanded_after_s"), "rest_ms": later_ms("rest_after_s")}

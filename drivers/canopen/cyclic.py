@@ -301,7 +301,7 @@ class CyclicImage:
         ages = self._fresh
         if min(self._seen) != self.cycles:
             ages = self.cycles - np.array(self._seen, dtype=np.float64)
-        if watch.first is None and not self._in_fault:
+        if watch.worst is None and not self._in_fault:
             fault, kind = None, FaultKind.DRIVE_FAULT
         else:
             fault, kind = watch.verdict(self._in_fault)

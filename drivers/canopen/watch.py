@@ -28,11 +28,14 @@ _KINDS: Final = {
 
 
 class NodeWatch:
-    """Keeps the first fault of any node until `rearm`; `seen_s` holds each node's last heartbeat (loop time)."""
+    """Keeps the most severe fault of any node, the first among equals, until `rearm`.
+
+    `seen_s` holds each node's last heartbeat (loop time).
+    """
 
     def __init__(self, nodes: tuple[AxisNode, ...], omap: ObjectMap, heartbeat_s: float) -> None:
-        self.first: Fault | None = None
-        self._first_index = 0
+        self.worst: Fault | None = None
+        self._worst_index = 0
         self.timeout_s = 3.0 * heartbeat_s
         self.seen_s: list[float | None] = [None] * len(nodes)
         self.emergencies: dict[int, int] = {}
@@ -41,8 +44,8 @@ class NodeWatch:
         self._states: list[int] = [codec.STATE_BOOT_UP] * len(nodes)
 
     def rearm(self) -> None:
-        """Forget the first fault and watch from here on."""
-        self.first, self._armed = None, True
+        """Forget what was kept and watch from here on."""
+        self.worst, self._armed = None, True
 
     def disarm(self) -> None:
         """Stop judging (bring-up and closing change node states on purpose)."""
@@ -90,13 +93,13 @@ class NodeWatch:
 
     def verdict(self, in_fault: tuple[int, ...]) -> tuple[Fault | None, FaultKind]:
         """What to report while the drives `in_fault` are in fault: a complaint of one that goes on comes last."""
-        if self.first is not None and self.first[1] in _KINDS:
-            return self.first, _KINDS[self.first[1]]
-        if in_fault and self._first_index not in in_fault:
+        if self.worst is not None and self.worst[1] in _KINDS:
+            return self.worst, _KINDS[self.worst[1]]
+        if in_fault and self._worst_index not in in_fault:
             return self.fault_of(in_fault[0]), FaultKind.DRIVE_FAULT
         if in_fault:
-            return self.first or self.fault_of(in_fault[0]), FaultKind.DRIVE_FAULT
-        return self.first, FaultKind.DRIVE_WARNING
+            return self.worst or self.fault_of(in_fault[0]), FaultKind.DRIVE_FAULT
+        return self.worst, FaultKind.DRIVE_WARNING
 
     def fault_of(self, index: int) -> Fault:
         """What is known about a drive that reports the fault state."""
@@ -106,5 +109,7 @@ class NodeWatch:
         return self._nodes[index].name, code, self._map.emergency_text(code)
 
     def _note(self, index: int, code: int, text: str) -> None:
-        if self._armed and self.first is None:
-            self.first, self._first_index = (self._nodes[index].name, code, text), index
+        # What a drive complains of must not hide that a node restarted, fell silent or is not alone.
+        graver = self.worst is None or (code in _KINDS and self.worst[1] not in _KINDS)
+        if self._armed and graver:
+            self.worst, self._worst_index = (self._nodes[index].name, code, text), index

@@ -64,7 +64,9 @@ def test_jammed_it_stops_all_axes_on_the_path(seed: int, kind: type[Exception], 
     cell, rows = move(seed, "jam")
     assert isinstance(cell.cause, kind), repr(cell.cause)
     assert cell.cause.where == "D.Z"
-    assert cell.ended_s - cell.fault_s < within_s
+    assert cell.result is not None
+    assert cell.result.stop is not None
+    assert cell.result.stop.found_s - cell.fault_s < within_s
     assert rows[:, 3].max() < cell.cell.limits.internal_force_n
     assert beside_the_path_mm(cell) < AS_SENT_MM
 

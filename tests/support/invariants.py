@@ -138,7 +138,8 @@ def _assert_rest(cell: ReadyCell, healthy: NDArray[np.bool_]) -> tuple[float, fl
 
 def _reaction(cell: ReadyCell, sent: Sent, stopped_s: float) -> tuple[str, float]:
     """The first thing that the commands do differently from the plan at full rate."""
-    rows = np.flatnonzero((sent.t_s >= cell.start_s) & (sent.t_s < cell.ended_s + 0.5 * CYCLE_S))
+    # What was sent at the very instant of the start was sent before it.
+    rows = np.flatnonzero((sent.t_s > cell.start_s) & (sent.t_s < cell.ended_s + 0.5 * CYCLE_S))
     first_s = float(sent.t_s[rows[0]])
     due = np.clip(np.rint((sent.t_s[rows] - first_s) / CYCLE_S).astype(int) + 1, 0, len(cell.plan.q_mm) - 1)
     asked = cell.plan.q_mm[due][:, np.array(cell.cell.driven)]

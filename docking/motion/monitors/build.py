@@ -31,6 +31,7 @@ def watch_limits(cell: CellFile) -> WatchLimits:
         measured_warp_n=limits.measured_warp_n,
         measured_whole_force_n=limits.measured_whole_force_n,
         measured_whole_warp_n=limits.measured_whole_warp_n,
+        standing_force_n=limits.standing_force_n,
         overload=limits.overload_fraction,
         underload=limits.underload_fraction,
     )

@@ -11,7 +11,8 @@ class WatchLimits:
 
     The following error may grow with the speed up to its ceiling. `measured_*` bound what the load cells show beyond
     the expected reactions: the change since the move was loaded, and, wider because cells drift and cross-talk, the
-    whole (`measured_whole_*`). `sync_error` bounds what path times apart may squeeze. `overload` and `underload` are
+    whole (`measured_whole_*`); `standing_force_n` bounds the change while the axes stand, from load to start and from
+    hold to resume. `sync_error` bounds what path times apart may squeeze. `overload` and `underload` are
     fractions of the expected load of a ball; the rating of an axis may be exceeded by `rating`.
     """
 
@@ -31,6 +32,7 @@ class WatchLimits:
     measured_warp_n: float = 600.0
     measured_whole_force_n: float = 2500.0
     measured_whole_warp_n: float = 1200.0
+    standing_force_n: float = 300.0
     overload: float = 1.1
     underload: float = 0.5
     rating: float = 1.1

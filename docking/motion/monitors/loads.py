@@ -26,6 +26,10 @@ from docking.types import Array
 SAME_SAMPLE_S = 0.025
 """Readings nearer together than this belong to one sample: the cells of a bus do not all report in the same cycle."""
 TARE_SAMPLES = 10
+HELD_S = 0.15
+"""So long after the commands of a held move have come to rest, the forces have, too."""
+RELIEVE = "Before the move: `docking relieve` takes strain out."
+CHANGED = "It changed while the axes stood: measure again."
 _TURN_RAD = 1e-3
 
 
@@ -57,6 +61,7 @@ class BallLoads:
         self._now: dict[Trigger, Finding] = {}
         self._before: dict[Trigger, Finding] = {}
         self._tare: Array | None = None
+        self._stood: Array | None = None
         self.force_n = self.warp_n = self.whole_force_n = self.whole_warp_n = float("nan")
 
     def about(self, q_mm: Array, *, relief: bool) -> None:
@@ -64,7 +69,7 @@ class BallLoads:
 
         A `relief` move starts from a strained part: there only what is added counts.
         """
-        self._relief = relief
+        self._relief, self._stood, self._held_mm = relief, None, q_mm
         if not self._whole.any():
             return
         positioners, up = self._positioners, self._load.up
@@ -86,6 +91,7 @@ class BallLoads:
         self._resolve(arms, up)
         self._ready = True
         self._tare = np.mean([self._resolved(f, q_mm) for f in self._rest], axis=0) if self._rest else None
+        self._stood = self._tare
 
     def _resolve(self, arms_mm: Array, up: Array) -> None:
         """Rows from axis forces (m,): ball forces in W (3k), their upward parts (k), warp (w)."""
@@ -107,8 +113,46 @@ class BallLoads:
         result: Array = self._rows @ beyond
         return result
 
-    def judge(self, force_n: Array, t_s: float, q_ref_mm: Array, *, moving: bool) -> Finding | None:
-        """Judge the newest readings; they count once, however often they are shown."""
+    def strained(self, force_n: Array) -> Finding | None:
+        """After `about`, before a move: what the part at rest shows already. Newest readings `force_n` (m,)."""
+        if not self._ready or self._relief:
+            return None
+        reads = np.mean(self._rest, axis=0) if self._rest else force_n
+        share = self._share(reads, self._q_mm, True)
+        force, warp = self._sizes(self._resolved(reads, self._q_mm))
+        limits = self._limits
+        found = None
+        if not (warp <= limits.measured_whole_warp_n):
+            found = Finding(Trigger.MEASURED_WARP, _warped(RELIEVE, warp, limits.measured_whole_warp_n))
+        if not (force <= limits.measured_whole_force_n):
+            found = Finding(Trigger.MEASURED_FORCE, _forced(RELIEVE, force, limits.measured_whole_force_n))
+        if found is None and share is not None:
+            error = share.error
+            cause = f"{error.cause} {RELIEVE}"
+            found = Finding(share.trigger, type(error)(error.where, cause, value=error.value, limit=error.limit))
+        return found
+
+    def changed(self, force_n: Array) -> Finding | None:
+        """At rest after `about` or in a hold: has the internal force at a ball changed since the axes came to rest?"""
+        if self._stood is None:
+            return None
+        force = self._sizes(self._resolved(force_n, self._held_mm) - self._stood)[0]
+        if self._margins.note("standing_force", force / self._limits.standing_force_n):
+            return None
+        return Finding(Trigger.MEASURED_FORCE, _forced(CHANGED, force, self._limits.standing_force_n))
+
+    def judge(
+        self, force_n: Array, t_s: float, q_ref_mm: Array, *, moving: bool, held_s: float = 0.0
+    ) -> Finding | None:
+        """Judge the newest readings; they count once, however often they are shown.
+
+        `held_s`: for so long the commands of a move that is held have stood.
+        """
+        if moving and not held_s > HELD_S:
+            self._stood, self._held_mm = None, q_ref_mm
+        elif moving and self._stood is None and self._ready:
+            # The first readings at rest: later ones are compared with them.
+            self._stood = self._resolved(force_n, self._held_mm)
         if force_n is self._seen:
             return self._finding
         self._seen = force_n
@@ -123,7 +167,11 @@ class BallLoads:
                 self._rest.append(force_n)
             else:
                 self._rest.clear()
-        self._now = {finding.trigger: finding for finding in self._violations(force_n, q_ref_mm, moving)}
+        violations = self._violations(force_n, q_ref_mm, moving)
+        if held_s > HELD_S:
+            changed = self.changed(force_n)
+            violations += [] if changed is None else [changed]
+        self._now = {finding.trigger: finding for finding in violations}
         self._finding = next((f for trigger, f in self._now.items() if trigger in self._before), None)
         return self._finding
 
@@ -169,6 +217,7 @@ class BallLoads:
         whole = self._resolved(force_n, q_ref_mm)
         if self._tare is None:
             self._tare = whole
+            self._stood = None if moving else whole
         added, limits = whole - self._tare, self._limits
         self.force_n, self.warp_n = self._sizes(added)
         self.whole_force_n, self.whole_warp_n = self._sizes(whole)
@@ -186,8 +235,8 @@ class BallLoads:
         found = []
         for trigger, monitor, value, limit, cause in cases:
             if not self._margins.note(monitor, value / limit):
-                kind = MeasuredForceTrip if trigger is Trigger.MEASURED_FORCE else MeasuredWarpTrip
-                found.append(Finding(trigger, kind("load cells", cause, value=value, limit=limit)))
+                error = (_forced if trigger is Trigger.MEASURED_FORCE else _warped)(cause, value, limit)
+                found.append(Finding(trigger, error))
         return found
 
     def _sizes(self, resolved: Array) -> tuple[float, float]:
@@ -195,3 +244,11 @@ class BallLoads:
         k = 3 * len(self._whole)
         balls = np.sqrt(np.sum(resolved[:k].reshape(-1, 3) ** 2, axis=1))
         return float(balls.max()), float(np.abs(resolved[k:]).max(initial=0.0))
+
+
+def _forced(cause: str, value: float, limit: float) -> MeasuredForceTrip:
+    return MeasuredForceTrip("load cells", cause, value=value, limit=limit)
+
+
+def _warped(cause: str, value: float, limit: float) -> MeasuredWarpTrip:
+    return MeasuredWarpTrip("load cells", cause, value=value, limit=limit)

@@ -67,6 +67,10 @@ class Travel:
         """A read-back at `t_s` says what the last one said."""
         self._last_s = t_s
 
+    def held_s(self, t_s: float) -> float:
+        """For how long the commands have stood at `t_s`."""
+        return t_s - self._stood_s
+
     def following(self, error_mm: Array, speed_mm_s: Array | float) -> Finding | None:
         """The following error of driven axes against a limit that grows with the speed of the axis."""
         magnitude = np.abs(error_mm)
@@ -87,7 +91,8 @@ class Travel:
         `moving` a move runs; `led` the axes follow set-points, none ramps down by itself.
         """
         if moving != self._moving:
-            self._moving, self._hold, self._stood_s, self._quiet = moving, None, feedback.t_s, 0
+            self._moving = moving
+            self._set_out(feedback.t_s)
             self._window.clear()
         if not led:
             self._window.clear()
@@ -110,9 +115,18 @@ class Travel:
         if not moving:
             return self._stand(feedback, last[0])
         if not led:
+            self._set_out(feedback.t_s)
             return None
         np.subtract(q_ref_mm, last[1], out=self._asked)
-        return self._stuck(feedback.following_error_mm, dt_s) or self._compare(feedback.position_mm, q_ref_mm)
+        if self._asked.any():
+            self._set_out(feedback.t_s)
+            return self._stuck(feedback.following_error_mm, dt_s) or self._compare(feedback.position_mm, q_ref_mm)
+        # A move that is held: the axes stand as they do without one.
+        return self._stand(feedback, last[0]) or self._compare(feedback.position_mm, q_ref_mm)
+
+    def _set_out(self, t_s: float) -> None:
+        """The axes are asked to move, or were until now: where they will stand is not known yet."""
+        self._hold, self._stood_s, self._quiet = None, t_s, 0
 
     def _jump(self, dt_s: float) -> Finding | None:
         np.abs(self._step, out=self._size)

@@ -111,6 +111,14 @@ class Watch:
         self._loads.about(q_mm, relief=relief)
         self._clean = None
 
+    def strained_before(self, feedback: Feedback) -> Finding | None:
+        """After `watch_about`: why no move may start with the part as it is; None for a relief, which is to help."""
+        return self._loads.strained(feedback.force_n)
+
+    def changed_at_rest(self, feedback: Feedback) -> Finding | None:
+        """Why a loaded or a held move may not go on: the forces are not those of when the axes came to rest."""
+        return self._loads.changed(feedback.force_n)
+
     # the cycle ---------------------------------------------------------------------------------------------------
     def power(self, feedback: Feedback, *, may_stop: bool = False) -> MotionError | None:
         """The first powered axis that is not enabled, or None; with `may_stop` an axis may also be ramping down."""
@@ -150,7 +158,7 @@ class Watch:
             found = (
                 self._travel.judge(feedback, q_ref_mm, moving=moving, led=led),
                 self._figure(feedback.position_mm, q_ref_mm),
-                self._loads.judge(feedback.force_n, feedback.t_s, q_ref_mm, moving=moving),
+                self._weigh(feedback, q_ref_mm, moving),
                 self._travel.following(feedback.following_error_mm, speed_mm_s),
                 self._held.judge(feedback),
             )
@@ -158,6 +166,10 @@ class Watch:
         finding = finding or self._told(feedback)
         self._clean = (feedback, q_ref_mm) if finding is None and feedback.fault is None else None
         return finding
+
+    def _weigh(self, feedback: Feedback, q_ref_mm: Array, moving: bool) -> Finding | None:
+        held_s = self._travel.held_s(feedback.t_s) if moving else 0.0
+        return self._loads.judge(feedback.force_n, feedback.t_s, q_ref_mm, moving=moving, held_s=held_s)
 
     def _unchanged(self, feedback: Feedback, q_ref_mm: Array) -> bool:
         """True when a driver passed on the same values: what was judged a cycle ago needs no second judgement."""
@@ -185,12 +197,18 @@ class Watch:
             return Finding(Trigger[feedback.fault_kind.name], DriveFault(axis, text, value=code))
         off = self.power(feedback, may_stop=may_stop)
         if off is not None:
-            return Finding(Trigger.AXIS_OFF, off)
-        worst_age, limit = float(feedback.age_cycles.max()), self._limits.missing_cycles
-        if worst_age == 0.0 or self._margins.note("missing_feedback", worst_age / limit):
+            return Finding(Trigger.AXIS_OFF, _explained(off, feedback))
+        ages, limit = feedback.age_cycles, self._limits.missing_cycles
+        worst_age = float(ages.max())
+        if worst_age == 0.0:
             return None
-        axis = self._axes[int(np.argmax(feedback.age_cycles))]
-        return Finding(Trigger.FEEDBACK_MISSING, FeedbackMissing(axis, value=worst_age, limit=limit))
+        self._margins.note("missing_feedback", worst_age / limit)
+        # As many read-backs missed in a row as the limit says are already too many.
+        if worst_age < limit:
+            return None
+        trigger = Trigger.ALL_MISSING if ages.min() >= limit else Trigger.FEEDBACK_MISSING
+        axis = self._axes[int(np.argmax(ages))]
+        return Finding(trigger, FeedbackMissing(axis, value=worst_age, limit=limit))
 
     def _told(self, feedback: Feedback) -> Finding | None:
         """What devices warn of: limit switches, emergencies of drives that go on."""
@@ -211,9 +229,8 @@ class Watch:
     ) -> Finding | None:
         """Judge without the figure, a few times: a late read-back beside fresh ones would look like a squeezed part."""
         self._late_in_a_row += 1
-        finding = self._loads.judge(feedback.force_n, feedback.t_s, q_ref_mm, moving=moving) or self._travel.following(
-            feedback.following_error_mm, speed_mm_s
-        )
+        finding = self._weigh(feedback, q_ref_mm, moving)
+        finding = finding or self._travel.following(feedback.following_error_mm, speed_mm_s)
         if finding is None and self._late_in_a_row > LATE_IN_A_ROW:
             finding = self._figure(feedback.position_mm, q_ref_mm)
         if finding is None:
@@ -274,3 +291,11 @@ class Watch:
         """The axis that is farthest from its place on the path."""
         k = int(np.argmax(np.abs(off_mm)))
         return f"{self._axes[k]} is {off_mm[k]:+.3f} mm from its place."
+
+
+def _explained(off: MotionError, feedback: Feedback) -> MotionError:
+    """An axis that is not enabled, with what its drive said of it."""
+    if feedback.fault is None or feedback.fault[0] != off.where:
+        return off
+    _, code, text = feedback.fault
+    return AxisNotEnabled(off.where, f"{text} ({code:04X}h)", value=off.value, limit=off.limit)

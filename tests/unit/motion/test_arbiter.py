@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from docking.errors import Defect, DriveFault, EventRefused, StopOverdue
+from docking.errors import AxisUnreferenced, BadArgument, Defect, DriveFault, EventRefused, StopOverdue
 from docking.motion.arbiter import FINAL, OPERATORS_OWN, REACTIONS, RELEASE_S, Arbiter, Mode, Reaction, Role
 from docking.motion.reactions import REQUESTS, WORDS, document
 from docking.motion.triggers import Finding, Trigger
@@ -49,7 +49,7 @@ def test_the_table_keeps_the_rules_of_the_house() -> None:
         else:
             assert reaction >= Reaction.PPS, f"{trigger} lets a move go on"
         if reaction is Reaction.SBT:
-            assert mode is Mode.STANDING, "no torque goes off in motion"
+            assert trigger is Trigger.DRIFT, "torque goes off only where an axis does not stand as it is told to"
     for trigger in Trigger:
         assert REACTIONS[trigger, Mode.STOPPING] >= REACTIONS[trigger, Mode.MOVING]
     for jam in (Trigger.STUCK, Trigger.COUPLING, Trigger.PREDICTED_FORCE, Trigger.MEASURED_FORCE, Trigger.OVERLOAD):
@@ -75,7 +75,9 @@ def test_every_trigger_in_every_mode_with_every_second_trigger(mode: Mode) -> No
         later = finding(two)
         severity = arbiter.raise_(later, 1.0 + CYCLE_S)
         assert severity >= got, f"{one.name} then {two.name} got milder"
-        if kept is not None:
+        if (one, two) == (Trigger.DRIVE_WARNING, Trigger.DRIVE_FAULT):
+            assert (arbiter.first, arbiter.later) == (later, (first,)), "the warning only announced the fault"
+        elif kept is not None:
             assert arbiter.first is kept, "the first cause is kept"
             assert arbiter.later == ((later,) if two not in REQUESTS and two is not one else ())
         else:
@@ -133,7 +135,7 @@ def test_a_stop_that_ends_in_time_stays_what_it_was(trigger: Trigger) -> None:
     arbiter.poll(0.95 * ALLOWED_S[reaction], True)
     for cycle in range(500):
         arbiter.poll(1.0 + cycle * CYCLE_S, True)
-    assert arbiter.mode is Mode.STANDING
+    assert arbiter.mode is (Mode.OFF if reaction is Reaction.SBT else Mode.STANDING)
     assert arbiter.reaction is (Reaction.NONE if trigger in REQUESTS else reaction)
     assert arbiter.latched is (trigger not in REQUESTS)
 
@@ -177,7 +179,7 @@ def test_who_may_reset_what(trigger: Trigger, role: Role) -> None:
     if role is Role.SUPERVISOR or (role is Role.OPERATOR and trigger in OPERATORS_OWN):
         arbiter.reset(role, 1.0)
         assert (arbiter.reaction, arbiter.first, arbiter.later) == (Reaction.NONE, None, ())
-        assert arbiter.mode is Mode.STANDING, "a reset moves nothing"
+        assert arbiter.mode in (Mode.STANDING, Mode.OFF), "a reset moves nothing"
     else:
         with pytest.raises(EventRefused, match="supervisor"):
             arbiter.reset(role, 1.0)
@@ -230,6 +232,40 @@ def test_no_reset_in_motion_after_the_hardware_chain_or_after_a_defect() -> None
     broken.poll(0.02, True)
     with pytest.raises(EventRefused, match="error"):
         broken.reset(Role.SUPERVISOR, 3.0)
+
+
+def test_another_drives_fault_does_not_take_the_place_of_a_warning() -> None:
+    arbiter = arbiter_in(Mode.MOVING)
+    warning = Finding(Trigger.DRIVE_WARNING, DriveFault("A.X", value=0x4210))
+    fault = Finding(Trigger.DRIVE_FAULT, DriveFault("B.X", value=0x2310))
+    arbiter.raise_(warning, 0.0)
+    assert arbiter.raise_(fault, 0.01) is Reaction.SQS
+    assert (arbiter.first, arbiter.later) == (warning, (fault,))
+
+
+@pytest.mark.parametrize("trigger", [Trigger.ENCODER_JUMP, Trigger.NODE_RESTARTED])
+def test_an_axis_without_reference_is_acknowledged_by_a_supervisor(trigger: Trigger) -> None:
+    """Whatever the first cause was, and however many axes it is."""
+    arbiter = arbiter_in(Mode.MOVING)
+    arbiter.require_referenced()
+    arbiter.raise_(finding(Trigger.LEASE_LOST), 0.0)
+    for axis in ("B.X", "C.Z", "B.X"):
+        arbiter.raise_(Finding(trigger, DriveFault(axis, value=1)), 0.0)
+    arbiter.poll(0.01, True)
+    arbiter.poll(0.02, True)
+    with pytest.raises(AxisUnreferenced, match=r"B\.X, C\.Z") as caught:
+        arbiter.require_referenced()
+    assert finding(Trigger.LEASE_LOST).error.text() in caught.value.text(), "the reason is told"
+    with pytest.raises(EventRefused, match=r"B\.X, C\.Z lost its reference.*supervisor"):
+        arbiter.reset(Role.OPERATOR, 1.0)
+    arbiter.reset(Role.SUPERVISOR, 2.0)
+    arbiter.require_referenced()
+
+
+def test_only_known_roles_reset() -> None:
+    assert [Role.named(role.value) for role in Role] == list(Role)
+    with pytest.raises(BadArgument, match="cleaner"):
+        Role.named("cleaner")
 
 
 def test_what_is_dropped_is_counted() -> None:

@@ -127,7 +127,7 @@ def test_a_tilt_loads_no_warp():
 
 
 def test_one_sample_is_none_and_a_sample_that_comes_in_two_parts_is_one():
-    bench = Bench(replace(WIDE, measured_force_n=500.0))
+    bench = Bench(replace(WIDE, measured_force_n=500.0, standing_force_n=9e9))
     spike = plus(4, 5000.0)
     for _ in range(3):
         assert bench.sample(spike) is None

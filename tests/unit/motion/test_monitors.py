@@ -16,7 +16,8 @@ from docking.errors import (
     InternalForceTrip,
     WarpTrip,
 )
-from docking.types import AxisState
+from docking.motion.triggers import Trigger
+from docking.types import AxisState, FaultKind
 from tests.reference_geometry import AXES, rc1
 from tests.support.motion_fakes import LIMITS, read_back, watch_of
 from tests.support.planned_moves import lab_site
@@ -177,14 +178,14 @@ def test_one_axis_out_in_a_crooked_cell_leaves_what_a_rigid_fit_leaves():
     assert 0.01 < watch.residual_mm < 0.05
 
 
-def test_silence_longer_than_the_limit_trips_and_names_the_axis():
+def test_two_read_backs_missed_in_a_row_trip_where_two_are_the_limit():
     age = np.zeros(12)
-    age[8] = 2.0
+    age[8] = 1.0
     assert judge(rc1_watch(), read_back(Q, age_cycles=age), Q, 0.0) is None
-    age[8] = 3.0
+    age[8] = 2.0
     trip = judge(rc1_watch(), read_back(Q, age_cycles=age), Q, 0.0)
     assert isinstance(trip, FeedbackMissing)
-    assert (trip.where, trip.value, trip.limit) == ("C.Z", 3.0, 2)
+    assert (trip.where, trip.value, trip.limit) == ("C.Z", 2.0, 2)
     age[8] = np.nan
     trip = judge(rc1_watch(WIDE), read_back(Q, age_cycles=age), Q, 0.0)
     assert isinstance(trip, FeedbackMissing)
@@ -249,8 +250,30 @@ def test_a_coupling_trip_names_the_axis_that_is_out_of_its_place(row):
     assert "-0.500 mm" in trip.text()
 
 
+def test_one_silent_axis_is_told_from_a_silent_bus():
+    age = np.full(12, 2.0)
+    finding = rc1_watch().evaluate(read_back(Q, age_cycles=age), Q, 0.0, moving=True)
+    assert finding is not None
+    assert finding.trigger is Trigger.ALL_MISSING
+    age[3] = 1.0
+    finding = rc1_watch().evaluate(read_back(Q, age_cycles=age), Q, 0.0, moving=True)
+    assert finding is not None
+    assert finding.trigger is Trigger.FEEDBACK_MISSING
+
+
+def test_an_axis_that_went_off_is_told_with_what_its_drive_said():
+    off = (*[AxisState.ENABLED] * 5, AxisState.STOPPING, *[AxisState.ENABLED] * 6)
+    said = {"states": off, "fault": ("B.Z", 0x8700, "SYNC lost"), "fault_kind": FaultKind.DRIVE_WARNING}
+    trip = judge(rc1_watch(), read_back(Q, **said), Q, 0.0)
+    assert isinstance(trip, AxisNotEnabled)
+    assert "SYNC lost (8700h)" in trip.text()
+    other = judge(rc1_watch(), read_back(Q, **(said | {"fault": ("A.X", 0x8700, "SYNC lost")})), Q, 0.0)
+    assert other is not None
+    assert "SYNC" not in other.text()
+
+
 def test_a_late_read_back_is_no_squeezed_part_but_is_told_with_what_else_trips():
-    watch = rc1_watch()
+    watch = rc1_watch(replace(LIMITS, missing_cycles=3))
     moved = np.full(12, 0.3)
     moved[4] = 0.0
     age = np.zeros(12)

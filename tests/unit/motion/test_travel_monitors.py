@@ -89,7 +89,7 @@ def test_an_axis_that_is_not_asked_to_move_is_not_stuck():
 
 
 def test_a_gap_in_the_read_backs_is_judged_over_its_whole_length():
-    bench = Bench()
+    bench = Bench(limits=replace(WIDE, missing_cycles=3))
     at = ramp(bench, 4.0, 2)
     ahead = at + 3 * 0.04
     late = one(3, 2.0)
