@@ -13,7 +13,7 @@ from typing import Any
 
 import click
 
-from docking.cli_survey import layout
+from docking.cli_survey import layout, network
 from docking.errors import (
     EXIT_FAULT,
     EXIT_OK,
@@ -278,6 +278,7 @@ def study_dock(cells: tuple[Path, ...], as_json: bool, **options: Any) -> int:
 
 
 cli.add_command(layout)
+cli.add_command(network)
 
 
 def _say(as_json: bool) -> Callable[[str], None]:

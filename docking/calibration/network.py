@@ -160,22 +160,24 @@ class _Snooping:
         self._used: NDArray[np.bool_] = np.ones(len(book.observations.point), dtype=np.bool_)
         self._rejected = list(book.rejected)
         self._doubtful = doubtful
+        self._out: set[int] = set()
+        """Points of which an observation was put out."""
 
     def run(self) -> Network:
         if self._doubtful:
             self._used &= ~np.isin(self._book.observations.point, sorted(self._doubtful))
             self._settle_doubtful(self._adjusted())
-        allowed = max(len(self._book.stations), len(self._used) // 4)
-        for _ in range(allowed + 1):
+        allowed = max(len(self._book.stations), len(self._used) // 10)
+        while len(self._out) <= allowed:
             adjusted = self._adjusted()
             worst = self._worst(adjusted)
             if worst is None:
                 return self._network(adjusted)
             self._put_out(worst, adjusted)
+        cause = "observation after observation would have to go until the rest fits: sigmas too small, or moved targets"
         raise NotCongruent(
-            "network", f"more than {allowed} observations would have to go until the rest fits", value=allowed,
-            limit=allowed,
-        )  # fmt: skip
+            "network", cause, value=len(self._book.points) - len(self._out), limit=len(self._book.points) - allowed
+        )
 
     def _adjusted(self) -> Adjusted:
         adjusted = adjust(self._book.observations.rows(self._used), self._poses, held=0)
@@ -225,6 +227,7 @@ class _Snooping:
     def _reject(self, row: int, why: tuple[str, str]) -> None:
         self._used[row] = False
         observations = self._book.observations
+        self._out.add(int(observations.point[row]))
         name = f"{self._book.stations[observations.station[row]]}: {self._book.points[observations.point[row]]}"
         self._rejected.append(Rejection(name, *why))
 

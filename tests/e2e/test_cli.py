@@ -28,6 +28,7 @@ COMMANDS = (
     ["check"],
     ["plan"],
     ["layout"],
+    ["network"],
     ["dry-run"],
     ["run"],
     ["sim"],

@@ -1,0 +1,40 @@
+"""The noise of measured points as a command line says it: `iso:MM`, or an instrument with the place where it stands."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+import numpy as np
+
+from docking.errors import BadArgument
+from docking.pose.noise import NOISE_PRESETS
+from docking.types import Array
+
+CovarianceOf = Callable[[Array], Array]
+"""Covariances (n, 3, 3) in mm^2 of readings at points (n, 3) of the measured frame."""
+
+_INSTRUMENTS = {"tracker": "laser-tracker", **{name: name for name in NOISE_PRESETS}}
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+
+
+def noise_from(spec: str, where: str = "--noise") -> CovarianceOf:
+    """The covariance that `spec` gives a reading.
+
+    `iso:MM` the same sigma for every coordinate; `tracker`, `laser-tracker`, `total-station`, each alone (it stands at
+    the origin of the measured frame) or with its place as in `tracker:X,Y,Z` in mm. Raises BadArgument.
+    """
+    kind, colon, rest = spec.partition(":")
+    numbers = [_number(text) for text in rest.split(",")] if colon else []
+    if kind == "iso" and len(numbers) == 1 and numbers[0] > 0.0:
+        variance = numbers[0] ** 2
+        return lambda points: np.tile(variance * np.eye(3), (len(points), 1, 1))
+    if kind in _INSTRUMENTS and len(numbers) in (0, 3) and all(np.isfinite(numbers)):
+        model, station = NOISE_PRESETS[_INSTRUMENTS[kind]], np.array(numbers or [0.0, 0.0, 0.0])
+        return lambda points: model.covariance(points - station)
+    forms = ", ".join(["iso:MM", *(f"{name}[:X,Y,Z]" for name in _INSTRUMENTS)])
+    raise BadArgument(where, f"one of {forms} is needed, in mm", value=spec)
+
+
+def _number(text: str) -> float:
+    return float(text) if _NUMBER.fullmatch(text.strip()) else float("nan")
