@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
 
-from docking.errors import DockingError
+from docking.errors import DockingError, LinkError
+from docking.sightings import InertialSample, PointFrame
 from docking.state import Event
 from docking.types import Array, Feedback, Identity, MoveResult, Plan, Reading
 
@@ -28,6 +29,41 @@ class Tracker(Protocol):
         Raises TargetLost when the instrument sees no reflector, DeviceSilent on a time-out.
         """
         ...
+
+    async def close(self) -> None: ...
+
+
+class PointStream(Protocol):
+    """A camera that reports tools and single markers many times a second.
+
+    `on_frame` gets every frame once, in order; `on_lost` is called once when the stream ends by itself.
+    """
+
+    on_frame: Callable[[PointFrame], None]
+    on_lost: Callable[[LinkError], None]
+
+    async def connect(self) -> Identity: ...
+
+    async def start(self) -> None:
+        """Begin to stream."""
+        ...
+
+    async def stop(self) -> None: ...
+
+    async def close(self) -> None: ...
+
+
+class InertialSensor(Protocol):
+    """Accelerations and turning rates many times a second; as `PointStream`."""
+
+    on_sample: Callable[[InertialSample], None]
+    on_lost: Callable[[LinkError], None]
+
+    async def connect(self) -> Identity: ...
+
+    async def start(self) -> None: ...
+
+    async def stop(self) -> None: ...
 
     async def close(self) -> None: ...
 
@@ -253,6 +289,18 @@ class SerialLink(Protocol):
     def write(self, data: bytes) -> None: ...
 
     def close(self) -> None: ...
+
+
+class SpeedLink(SerialLink, Protocol):
+    """A serial link whose far end chooses its speed while it is open."""
+
+    async def set_baud(self, baud: int) -> None:
+        """Change the host's speed, bit/s. Raises LinkLost."""
+        ...
+
+    async def send_break(self) -> None:
+        """Hold the line low for longer than a character; without effect where the link has no such thing."""
+        ...
 
 
 CanFrame = tuple[int, bytes]

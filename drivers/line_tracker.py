@@ -8,7 +8,6 @@ counted. While it measures the device sends heartbeats, so silence is noticed wi
 from __future__ import annotations
 
 import asyncio
-from collections import deque
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -18,6 +17,7 @@ from docking.config.cell import TrackerConfig
 from docking.errors import BadReply, DeviceRefused, DeviceSilent, LinkError, LinkLost, TargetLost, WrongIdentity
 from docking.ports import SerialLink
 from docking.types import Array, Identity, Reading
+from drivers.garbage import GarbageWatch
 from drivers.line_codec import (
     CHANGED,
     DEGRADED,
@@ -39,7 +39,6 @@ from drivers.readings import Covariance, FrozenWatch, reading_covariance
 PROTOCOL_VERSION = 1
 COMMAND_TIMEOUT_S = 1.0
 SILENCE_S = 1.0
-BAD_LINES_PER_S = 5
 UM_PER_MM = 1000.0
 
 NO_TARGET, BEAM_BROKEN = 10, 11
@@ -82,7 +81,7 @@ class LineTracker:
         self._frozen = FrozenWatch()
         self._turn = asyncio.Lock()
         self._request: _Request | None = None
-        self._bad_at_s: deque[float] = deque(maxlen=BAD_LINES_PER_S + 1)
+        self._garbage = GarbageWatch()
         self._seq = 0
         self._newest_t_us = -1
         self._heard_at_s = 0.0
@@ -107,6 +106,7 @@ class LineTracker:
         await self._link.open()
         self._lost = None
         self._parser.reset()
+        self._garbage.reset()
         self._newest_t_us = -1
         # Replies of an earlier session must not fit: the numbering starts where the clock happens to stand.
         self._seq = int(asyncio.get_running_loop().time() * 1000.0) % SEQ_MODULUS
@@ -179,17 +179,25 @@ class LineTracker:
             limit_s = min(deadline_s, self._heard_at_s + SILENCE_S)
             if loop.time() >= limit_s:
                 what, limit = ("reply", timeout_s) if limit_s == deadline_s else ("intact line", SILENCE_S)
-                heard = f"{self.bad_lines} bad lines and {self.noise_bytes} bytes of noise received so far"
-                raise DeviceSilent("tracker", f"no {what}; {heard}", limit=limit)
+                raise DeviceSilent("tracker", f"no {what}; {self._heard()}", limit=limit)
             await asyncio.wait({reply}, timeout=limit_s - loop.time())
         return reply.result()
+
+    def _heard(self) -> str:
+        """What came instead of a reply, so far."""
+        counts = self.counts
+        return (
+            f"so far {self.bad_lines} bad lines, {self.noise_bytes} bytes of noise, {counts.stale} replies under "
+            f"another number, {counts.wrong_target} for another target, {counts.old_time} with an old time"
+        )
 
     def _on_bytes(self, data: bytes) -> None:
         bad_before = self._parser.bad
         for reply in self._parser.feed(data):
             self._take(reply)
-        for _ in range(self._parser.bad - bad_before):
-            self._count_bad()
+        distrust = self._garbage.count(self._parser.bad - bad_before, asyncio.get_running_loop().time())
+        if distrust:
+            self._fail(BadReply("tracker", "garbage on the line", value=distrust))
 
     def _take(self, reply: Reply) -> None:
         self._heard_at_s = asyncio.get_running_loop().time()
@@ -206,14 +214,6 @@ class LineTracker:
             if isinstance(reply, PointLine):
                 self._newest_t_us = reply.t_us
             request.reply.set_result(reply)
-
-    def _count_bad(self) -> None:
-        """More than BAD_LINES_PER_S bad lines in one second end the request: the line cannot be trusted."""
-        now_s = asyncio.get_running_loop().time()
-        self._bad_at_s.append(now_s)
-        if len(self._bad_at_s) > BAD_LINES_PER_S and now_s - self._bad_at_s[0] <= 1.0:
-            count = len(self._bad_at_s)
-            self._fail(BadReply("tracker", "garbage on the line", value=f"{count} bad lines within 1 s"))
 
     def _on_lost(self, reason: str) -> None:
         self._lost = reason

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from docking.config.base import Finite, Model
+from docking.config.base import Finite, Model, Name
 
 
 class AirConfig(Model):
@@ -40,3 +40,38 @@ class GeocomConfig(Model):
     air: AirConfig | None = Field(
         default=None, description="atmospheric correction, written and read back; left as it is when not given"
     )
+
+
+class NdiToolConfig(Model):
+    """A tool that is not plugged in: its definition has to be loaded."""
+
+    name: Name = Field(description="as the frames shall call it")
+    rom: str = Field(min_length=1, description="its definition file (.rom), relative to the cell file")
+
+
+class NdiConfig(Model):
+    """A camera that speaks the NDI Combined API."""
+
+    port: str = Field(min_length=1, description="any pyserial URL")
+    baud: Literal[9600, 14400, 19200, 38400, 57600, 115200, 230400, 921600] = Field(
+        default=115200, description="line speed that device and host go over to, bit/s"
+    )
+    rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)] = Field(
+        default=60.0, description="exposures a second: how fast the frames count up"
+    )
+    strays: bool = Field(default=True, description="report markers that belong to no tool")
+    tools: tuple[NdiToolConfig, ...] = Field(default=(), description="tools whose definition is loaded")
+
+
+class InertialConfig(Model):
+    """An inertial sensor that speaks the VectorNav ASCII protocol."""
+
+    port: str = Field(min_length=1, description="any pyserial URL")
+    baud: Literal[9600, 19200, 38400, 57600, 115200, 128000, 230400, 460800, 921600] = Field(
+        default=115200, description="line speed, as the sensor is set, bit/s"
+    )
+    message: Literal["VNYMR", "VNIMU"] = Field(
+        default="VNYMR",
+        description="VNYMR: attitude and compensated measurements; VNIMU: calibrated measurements without filter",
+    )
+    rate_hz: Literal[1, 2, 4, 5, 10, 20, 25, 40, 50, 100, 200] = Field(default=100, description="samples a second")

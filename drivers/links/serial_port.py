@@ -9,6 +9,7 @@ a reader that meets any of them reports the port as lost, once, in words.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import termios
 import threading
@@ -20,6 +21,7 @@ from docking.errors import LinkLost, PortMissing
 
 READ_WAIT_S = 0.1
 WRITE_WAIT_S = 0.5
+BREAK_S = 0.3
 INBOX_LIMIT = 65536
 
 GONE = (serial.SerialException, OSError, termios.error)
@@ -57,13 +59,16 @@ def _ignore(_: object) -> None:
 
 
 class SerialPort:
-    """`docking.ports.SerialLink` over pyserial: 8 data bits, no parity, 1 stop bit, no flow control."""
+    """`docking.ports.SpeedLink` over pyserial: 8 data bits, no parity, 1 stop bit, no flow control.
 
-    def __init__(self, url: str, baud: int) -> None:
+    Error `where` is `name`, the device at the far end.
+    """
+
+    def __init__(self, url: str, baud: int, name: str = "tracker") -> None:
         self.on_bytes: Callable[[bytes], None] = _ignore
         self.on_lost: Callable[[str], None] = _ignore
         self.dropped_bytes = 0
-        self._url, self._baud = url, baud
+        self._url, self._baud, self._name = url, baud, name
         self._port: serial.Serial | None = None
         self._thread: threading.Thread | None = None
         self._loop: asyncio.AbstractEventLoop
@@ -77,7 +82,7 @@ class SerialPort:
         try:
             port = await asyncio.to_thread(self._open_port)
         except (*GONE, ValueError) as error:
-            raise PortMissing("tracker", _words(error), value=self._url) from error
+            raise PortMissing(self._name, _words(error), value=self._url) from error
         self._stopping = threading.Event()
         self._port = port
         self._thread = threading.Thread(
@@ -93,11 +98,26 @@ class SerialPort:
     def write(self, data: bytes) -> None:
         """Hand bytes to the port; LinkLost when it is closed, gone or takes no bytes."""
         if self._port is None:
-            raise LinkLost("tracker", f"{self._url} is not open")
+            raise LinkLost(self._name, f"{self._url} is not open")
         try:
             self._port.write(data)
         except GONE as error:
-            raise LinkLost("tracker", f"{self._url}: {_words(error)}") from error
+            raise LinkLost(self._name, f"{self._url}: {_words(error)}") from error
+
+    async def set_baud(self, baud: int) -> None:
+        """Change the speed; a network port negotiates it. Raises LinkLost."""
+        if self._port is None:
+            raise LinkLost(self._name, f"{self._url} is not open")
+        try:
+            await asyncio.to_thread(setattr, self._port, "baudrate", baud)
+        except (*GONE, ValueError) as error:
+            raise LinkLost(self._name, f"{self._url}: {_words(error)}") from error
+
+    async def send_break(self) -> None:
+        """Hold the line low; ports that cannot (a raw socket, a pseudo-terminal) let it pass."""
+        if self._port is not None:
+            with contextlib.suppress(*GONE):
+                await asyncio.to_thread(self._port.send_break, BREAK_S)
 
     def close(self) -> None:
         """Stop the reader and release the port; `on_lost` is not called."""

@@ -17,6 +17,14 @@ class DeviceEnd(Protocol):
     def write(self, data: bytes) -> None: ...
 
 
+class SpeedEnd(DeviceEnd, Protocol):
+    """The device's end of a line whose speed the device can change; `on_break` is called when the host sends one."""
+
+    on_break: Callable[[], None]
+
+    def set_baud(self, baud: int) -> None: ...
+
+
 class PacedChannel:
     """One direction of a line: chunks queue behind each other, each delivered whole when its last byte is through."""
 
@@ -31,6 +39,10 @@ class PacedChannel:
         if data:
             self._free_at_s = max(self._loop.time(), self._free_at_s) + len(data) * self._byte_s
             self._loop.call_at(self._free_at_s, self._arrive, data, self._epoch)
+
+    def set_baud(self, baud: int) -> None:
+        """Change the speed for what is sent from now on."""
+        self._byte_s = BITS_PER_BYTE / baud
 
     def cut(self) -> None:
         """Lose every byte that is still under way."""

@@ -24,14 +24,19 @@ def _ignore(_: object) -> None:
     """Bytes that nobody listens for are lost, as on a line with no receiver."""
 
 
+def _deaf() -> None:
+    """No break ever reaches the master of a pty."""
+
+
 class PtySerial:
-    """A pty with the device on its master side; satisfies `sim.wires.pacing.DeviceEnd`.
+    """A pty with the device on its master side; satisfies `sim.wires.pacing.SpeedEnd`.
 
     `link` is the stable name to make (a symbolic link to the slave), or None; `path` is what a client opens.
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop, baud: int, link: Path | None = None) -> None:
         self.on_bytes: Callable[[bytes], None] = _ignore
+        self.on_break: Callable[[], None] = _deaf
         self.path = ""
         self.lost_bytes = 0
         self._loop, self._link = loop, link
@@ -55,6 +60,11 @@ class PtySerial:
         """Send bytes to the client at the pace of the line; lost when the terminal is closed."""
         if self._master >= 0:
             self._to_client.send(data)
+
+    def set_baud(self, baud: int) -> None:
+        """Pace both directions anew; what the client has set cannot be known."""
+        self._to_client.set_baud(baud)
+        self._to_device.set_baud(baud)
 
     def close(self) -> None:
         """Take the terminal away; a client that has it open meets an input/output error, as with a pulled cable."""

@@ -1,12 +1,14 @@
 """A serial line inside the process: `near` is the host's `docking.ports.SerialLink`, `far` belongs to the device.
 
 Both directions are paced at the baud rate with one timer a chunk, so an exchange takes the wire time of its bytes on
-the loop's clock. `unplug` makes the port vanish as a pulled cable does; `missing` lets `open` fail.
+the loop's clock. `unplug` makes the port vanish as a pulled cable does; `missing` lets `open` fail. Each end has a speed
+of its own; while they differ, both receive garbage.
 """
 
 from __future__ import annotations
 
 import asyncio
+import random
 from collections.abc import Callable
 
 from docking.errors import LinkLost, PortMissing
@@ -15,6 +17,10 @@ from sim.wires.pacing import PacedChannel
 
 def _ignore(_: object) -> None:
     """Bytes that nobody listens for are lost, as on a line with no receiver."""
+
+
+def _deaf() -> None:
+    """A break that no device listens for."""
 
 
 class HostEnd:
@@ -38,6 +44,17 @@ class HostEnd:
             raise LinkLost(self._wire.name, "the port is not open")
         self._wire.to_device.send(data)
 
+    async def set_baud(self, baud: int) -> None:
+        """Change the host's speed; LinkLost when the port is closed or gone."""
+        if not self._is_open:
+            raise LinkLost(self._wire.name, "the port is not open")
+        self._wire.set_host_baud(baud)
+
+    async def send_break(self) -> None:
+        """Hold the line low."""
+        if self._is_open:
+            self._wire.far.on_break()
+
     def close(self) -> None:
         self._is_open = False
 
@@ -58,10 +75,15 @@ class FarEnd:
 
     def __init__(self, wire: VirtualSerial) -> None:
         self.on_bytes: Callable[[bytes], None] = _ignore
+        self.on_break: Callable[[], None] = _deaf
         self._wire = wire
 
     def write(self, data: bytes) -> None:
         self._wire.to_host.send(data)
+
+    def set_baud(self, baud: int) -> None:
+        """Change the device's speed."""
+        self._wire.set_device_baud(baud)
 
     def deliver(self, data: bytes) -> None:
         """Bytes have reached the device."""
@@ -75,8 +97,24 @@ class VirtualSerial:
         self.name = name
         self.missing = False
         self.near, self.far = HostEnd(self), FarEnd(self)
-        self.to_device = PacedChannel(loop, baud, self.far.deliver)
-        self.to_host = PacedChannel(loop, baud, self.near.deliver)
+        self.to_device = PacedChannel(loop, baud, lambda data: self.far.deliver(self._heard(data)))
+        self.to_host = PacedChannel(loop, baud, lambda data: self.near.deliver(self._heard(data)))
+        self._host_baud = self._device_baud = baud
+        self._noise = random.Random(baud)
+
+    def set_host_baud(self, baud: int) -> None:
+        """The host sends and listens at this speed from now on."""
+        self._host_baud = baud
+        self.to_device.set_baud(baud)
+
+    def set_device_baud(self, baud: int) -> None:
+        """The device sends and listens at this speed from now on."""
+        self._device_baud = baud
+        self.to_host.set_baud(baud)
+
+    def _heard(self, data: bytes) -> bytes:
+        """What the other end makes of the bytes."""
+        return data if self._host_baud == self._device_baud else self._noise.randbytes(len(data))
 
     def unplug(self, reason: str = "the port has vanished") -> None:
         """Pull the cable: bytes under way are lost, the host hears `on_lost`, `open` fails until `replug`."""
