@@ -8,6 +8,9 @@ from pydantic import Field, model_validator
 
 from docking.config.base import Finite, Model, Name
 
+INERTIAL_LINE_BYTES = {"VNYMR": 140, "VNIMU": 125}
+"""Longest line of each message, time stamp and checksum included."""
+
 
 class AirConfig(Model):
     """The air in which the instrument measures distances."""
@@ -74,4 +77,12 @@ class InertialConfig(Model):
         default="VNYMR",
         description="VNYMR: attitude and compensated measurements; VNIMU: calibrated measurements without filter",
     )
-    rate_hz: Literal[1, 2, 4, 5, 10, 20, 25, 40, 50, 100, 200] = Field(default=100, description="samples a second")
+    rate_hz: Literal[1, 2, 4, 5, 10, 20, 25, 40, 50, 100, 200] = Field(default=50, description="samples a second")
+
+    @model_validator(mode="after")
+    def _fits_the_line(self) -> Self:
+        """A sample is a line of text: the line has to carry them all."""
+        most_hz = 0.95 * self.baud / (10.0 * INERTIAL_LINE_BYTES[self.message])
+        if not self.rate_hz <= most_hz:
+            raise ValueError(f"{self.baud} bit/s carry no more than {most_hz:.0f} {self.message} a second")
+        return self
