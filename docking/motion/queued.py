@@ -41,7 +41,7 @@ BRAKE_S = 2.0
 TOLD_S = 0.5
 """In so long a stop has reached every controller that can be reached, and its end has been seen."""
 GOLDEN, SHARE = 0.618, 0.2
-"""Polls come up to this share of their period early, spread evenly."""
+"""During a move polls come up to this share of their period early, spread evenly."""
 RESET_S = 0.3
 """How long nothing may be found again after the controllers were told to forget their faults."""
 
@@ -257,8 +257,9 @@ class QueuedMotion:
         """
         loop = asyncio.get_running_loop()
         self._sleeper = loop.create_future()
-        # Never in step with the scans: the phase decides how old the path time is that a read-back shows.
-        self._phase = (self._phase + GOLDEN) % 1.0
+        if self._move is not None:
+            # Never in step with the scans: the phase decides how old the path time is that a read-back shows.
+            self._phase = (self._phase + GOLDEN) % 1.0
         timer = loop.call_at(self._polled_s + self._poll_s * (1.0 - SHARE * self._phase), self._wake)
         try:
             await self._sleeper

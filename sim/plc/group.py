@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from docking.config.cell import CellFile
+from sim.plc.drives import FailedDrives
 from sim.plc.modbus_tcp import ModbusTcpConnection
 from sim.plc.playback import Point
 from sim.plc.positioner import SCAN_S, Lines, PositionerPlc
@@ -49,6 +50,9 @@ class PlcGroup:
         self._target_mm = np.array(plant.encoder_mm(), dtype=np.float64)
         self._powered = np.zeros(len(self._driven), dtype=np.bool_)
         self._braked = self._driven.copy()
+        self._drives = FailedDrives(np.array([a.a_quick_mm_s2 for p in cell.positioners for a in p.axes]))
+        self._step_mm = np.zeros(len(self._driven))
+        self._dt_s = SCAN_S
         self._targets: list[Point] = []
         self._states: list[tuple[State, bool]] = []
         self._before_s = self._due_s = loop.time()
@@ -116,10 +120,20 @@ class PlcGroup:
         plc, index = self._axis(axis)
         plc.guard.limit[index] = pressed
 
-    def fail_drive(self, axis: str, failed: bool = True) -> None:
-        """Have the drive of `axis` report a fault (fault injection)."""
+    def fail_drive(self, axis: str, torque: bool = True) -> None:
+        """Have the drive of `axis` go to fault: it ramps down by itself, or without `torque` its brake takes the axis.
+
+        Its PLC hears of it in the next scan but one, as of anything that happens right after its inputs were read.
+        """
+        index = self._cell.axis_names.index(axis)
+        speed_mm_s = float(self._step_mm[index]) / self._dt_s
+        self._drives.fail(index, float(self._target_mm[index]), speed_mm_s, torque)
+
+    def repair_drive(self, axis: str) -> None:
+        """The drive of `axis` is no longer in fault."""
         plc, index = self._axis(axis)
-        plc.guard.drive_fault[index] = failed
+        self._drives.repair(self._cell.axis_names.index(axis))
+        plc.guard.drive_fault[index] = False
 
     def _axis(self, axis: str) -> tuple[PositionerPlc, int]:
         number, index = divmod(self._cell.axis_names.index(axis), AXES)
@@ -148,8 +162,14 @@ class PlcGroup:
         )
         for plc, rate in self._clocked:
             plc.play(lines, now_s, dt_s * rate)
+        before_mm, self._dt_s = self._target_mm, dt_s or SCAN_S
         self._draw()
-        self._plant.step(now_s, self._target_mm, self._powered, self._braked)
+        self._step_mm = self._target_mm - before_mm
+        asked = (self._target_mm, self._powered, self._braked)
+        failed = self._drives.indices
+        self._plant.step(now_s, *(self._drives.lead(dt_s, *asked) if failed else asked))
+        for index in failed:
+            self.plcs[index // AXES].guard.drive_fault[index % AXES] = True
         self._readings.next_scan()
 
     def _draw(self) -> None:

@@ -251,6 +251,34 @@ def test_a_jammed_axis_drops_group_ok_and_all_take_the_quick_ramp(axis: int) -> 
     play(scenario)
 
 
+@pytest.mark.parametrize("torque", [True, False])
+def test_a_drive_in_fault_leaves_the_path_by_its_own_ramp(torque: bool) -> None:
+    """x(t) = x0 + v t - a t^2 / 2 from where it failed, whatever its PLC plays on; without torque its brake closes."""
+
+    async def scenario(hand: Hand) -> None:
+        await running(hand, 1.5)
+        axis, a_mm_s2 = 8, 200.0
+        hand.group.fail_drive(cell().axis_names[axis], torque)
+        (t0_s, before), (t1_s, at) = hand.plant.history[-2:]
+        speed = (at[axis] - before[axis]) / (t1_s - t0_s)
+        await hand.wait(0.011)
+        assert all(plc.fault is Fault.NONE for plc in hand.plcs), "its PLC hears of it in the next scan but one"
+        assert hand.plant.powered[axis] == torque
+        assert hand.plant.braked[axis] != torque
+        await hand.wait(0.01)
+        assert [plc.fault for plc in hand.plcs] == [Fault.DRIVE if i == 2 else Fault.GROUP_LINE for i in range(4)]
+        if torque:
+            end_mm = at[axis] + np.sign(speed) * speed**2 / (2.0 * a_mm_s2)
+            assert hand.plant.position_mm[axis] == pytest.approx(end_mm, abs=1e-6)
+        await hand.wait(0.5)
+        assert hand.plcs[2].state is State.FAULT
+        hand.group.repair_drive(cell().axis_names[axis])
+        await hand.wait(0.02)
+        assert not hand.plcs[2].guard.drive_fault[2], "its PLC hears that it is repaired"
+
+    play(scenario)
+
+
 @pytest.mark.parametrize(("fault", "axis"), [(Fault.LIMIT, 4), (Fault.DRIVE, 8), (Fault.FOLLOWING_ERROR, 1)])
 def test_limit_drive_and_following_error_drop_group_ok(fault: Fault, axis: int) -> None:
     async def scenario(hand: Hand) -> None:
