@@ -44,18 +44,48 @@ class RecordedPlant:
         self.weigh_from_s = float("inf")
         self.weigh_until_s = float("inf")
         self.force_n_at: list[tuple[float, float]] = []
+        self.beyond_n_at: list[Array] = []
+        self._seizes: tuple[str, float] | None = None
         self.encoder_mm = plant.encoder_mm
         self.following_error_mm = plant.following_error_mm
         self.at_rest = plant.at_rest
         self.force_n = plant.force_n
         self.press = plant.press
 
+    def seize_within(self, axis: str, share: float) -> None:
+        """Have an axis seize after this share of the next step."""
+        self._seizes = (axis, share)
+
+    def _seize_back(self, before_mm: Array) -> None:
+        """The step that was just made ended for one axis where it seized; its set-point went on."""
+        assert self._seizes is not None
+        (axis, share), self._seizes, bank = self._seizes, None, self.plant._bank
+        k = self.axes.index(axis)
+        back_mm = (1.0 - share) * float(bank.motor_mm[k] - before_mm[k])
+        self.plant.displace(axis, -back_mm)
+        bank._set[k] += back_mm
+        self.plant.jam(axis)
+
     def step(self, t_s: float, target_mm: Array, powered: NDArray[np.bool_], braked: NDArray[np.bool_]) -> None:
         self.plant.step(t_s, target_mm, powered, braked)
+        if self._seizes is not None:
+            self._seize_back(self.ticks[-1].motor_mm)
         motor = self.plant._bank.motor_mm.copy()
         self.ticks.append(Tick(t_s, target_mm.copy(), motor, powered.copy(), braked.copy()))
         if self.weigh_from_s <= t_s <= self.weigh_until_s:
-            self.force_n_at.append((t_s, self.plant.true_internal_force_n()))
+            beyond_n = self.beyond_n()
+            self.beyond_n_at.append(beyond_n)
+            self.force_n_at.append((t_s, float(np.linalg.norm(beyond_n, axis=1).max())))
+
+    def beyond_n(self) -> Array:
+        """True ball forces (k, 3) beyond what equilibrium needs, now."""
+        plant = self.plant
+        elapsed_s = plant.elapsed_s(plant._t_s)
+        plant._refresh(elapsed_s)
+        balls, com = plant._geometry(elapsed_s)
+        needed = plant._equilibrium.stress_free_n(plant._equilibrium.body, balls, com, plant._weight_n)
+        forces: Array = plant._equilibrium.ball_forces_n(plant._equilibrium.force_n - needed)
+        return forces
 
 
 @dataclass
