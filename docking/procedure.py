@@ -7,7 +7,7 @@ the first frame of its move leaves.
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -222,6 +222,7 @@ class Procedure:
             error_mm=float(errors.norm_mm[i]),
             sigma_mm=float(errors.sigma_mm[i]),
             tolerance_mm=float(errors.tolerance_mm[i]),
+        positioners = replace(positioners, balls_C_mm=fit.grown(positioners.balls_C_mm))
         )
         last = p.passes >= self._approach.convergence.max_passes
         agree = self._independent.check_points(fit, last=last) and self._independent.features(fit, mate, last=last)
@@ -296,6 +297,8 @@ class Procedure:
         if missing:
             raise PermissiveMissing(missing[0], value=station.name)
         answer = await self.operator.confirm(plan, shown)
+        goal, rule = self._approach.docked_goal(self._component_fit(), self._mate_fit()), self._approach.goal
+        self.journal.write("goal", records.goal_record(goal, rule, self._approach.features.names, station.name))
         self.journal.write("confirm", {"plan_hash": plan.plan_hash, "go": answer is Event.CONFIRMED})
         if answer is Event.CONFIRMED and not back and not (self._fit_age_s() <= self._settings.fit_age_s):
             self.operator.notify("stale", age_s=self._fit_age_s(), limit_s=self._settings.fit_age_s)

@@ -163,6 +163,10 @@ class Fit(_Frozen):
         return cov
 
 
+    def grown(self, p_N_mm: ArrayLike) -> Array:
+        """Points `p_N_mm` (..., 3) of the fitted body in N with its expansion: `X_MN` takes them to `predict`."""
+        return self.X_MN.inverse().apply(self.predict(p_N_mm))
+
 RISK_LIMIT = 0.025
 """Largest probability, given what was measured, that any docking feature of an accepted docking is out of tolerance."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,7 +21,15 @@ from docking.config.build import (
     positioners_from,
 )
 from docking.config.cell import ModbusBus
-from docking.config.nominal import ers_points, feature_points, mate_feature_points, measured_features, target_points
+from docking.config.nominal import (
+    ers_points,
+    feature_points,
+    goal_rule,
+    mate_feature_points,
+    measured_features,
+    target_points,
+)
+from docking.config.temperatures import part_temperatures, with_temperatures
 from docking.geometry import pose_from_vector
 from docking.kinematics import Positioners
 from docking.motion.settle import SettleSettings
@@ -148,3 +156,4 @@ def _approach(cell: CellFile, job: JobFile) -> Approach:
         stations=tuple(Station(s.name, s.standoff_mm, s.speed_mm_s, s.permissives) for s in job.stages),
         convergence=convergence_settings(cell, job),
     )
+        goal=goal_rule(job),

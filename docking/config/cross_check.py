@@ -13,7 +13,7 @@ from docking.config.cell import CellFile, PositionerConfig
 from docking.config.document import cell_document_findings, job_document_findings
 from docking.config.findings import Finding, error, errors_of, warning
 from docking.config.job import JobFile, Target
-from docking.config.nominal import feature_points, mate_feature_points
+from docking.config.nominal import docked_in_mate, feature_points, mate_feature_points
 from docking.config.support import (
     follower_findings,
     rank_findings,
@@ -24,7 +24,7 @@ from docking.config.support import (
 from docking.errors import DockingError
 from docking.pose.layout import spread
 from docking.pose.settings import FitSettings
-from docking.pose.svd import fit_svd, mirrored_rms_mm
+from docking.pose.svd import mirrored_rms_mm
 from docking.types import RISK_LIMIT, Array
 
 UNIT_TOLERANCE = 1e-4
@@ -191,7 +191,7 @@ def _congruence(cell: CellFile, job: JobFile) -> list[Finding]:
     """The component's features must be able to meet those of the mate: same figure, not its mirror image."""
     component = feature_points(job.component, cell).xyz_mm
     mate = mate_feature_points(job.component, job.mate, cell).xyz_mm
-    gap = np.linalg.norm(fit_svd(component, mate).apply(component) - mate, axis=1)
+    gap = np.linalg.norm(docked_in_mate(job, cell).apply(component) - mate, axis=1)
     limits = np.array([feature.tolerance_mm for feature in job.component.features])
     worst = int(np.argmax(gap - limits))
     if gap[worst] <= limits[worst]:

@@ -296,7 +296,7 @@ def test_the_catalogues_have_the_same_words_and_every_word_is_used() -> None:
         assert sorted(re.findall(r"{(\w+)}", english[key])) == sorted(re.findall(r"{(\w+)}", chinese[key])), key
     room = Path(__file__).parents[3] / "docking"
     source = "".join(p.read_text("utf-8") for p in (*room.glob("report/*.py"), room / "templates" / "report.html.j2"))
-    composed = ("outcome_", "said_", "event_", "fit_", "before", "after", "final")
+    composed = ("outcome_", "said_", "event_", "fit_", "goal_", "before", "after", "final")
     assert [key for key in english if not re.search(rf"\b{key}\b", source) and not key.startswith(composed)] == []
 
 
