@@ -9,6 +9,7 @@ import numpy as np
 
 from docking.geometry import pose_to_vector
 from docking.planning.relief import Strain, Weighing
+from docking.pose.goal import Goal, GoalRule
 from docking.types import Alarm, Array, FeatureErrors, Fit, MoveResult, Plan, PlanBounds, Pose, Rejection, StopTimes
 
 POSE_KEYS = ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
@@ -66,6 +67,19 @@ def features_record(errors: FeatureErrors, stage: str, when: str) -> dict[str, A
         "tolerance_mm": errors.tolerance_mm.tolist(),
         "risk": errors.risk,
         "accepted": errors.accepted(),
+    }
+
+
+def goal_record(goal: Goal, rule: GoalRule, names: tuple[str, ...], stage: str) -> dict[str, Any]:
+    """The docked goal that a move to `stage` heads for, and what it leaves at the features."""
+    return {
+        "stage": stage,
+        "rule": rule.kind,
+        "locks": list(rule.locks),
+        "X_WC": goal.X_WC.matrix().tolist(),
+        "names": list(names),
+        "misfit_mm": goal.misfit_mm.tolist(),
+        "share": goal.share.tolist(),
     }
 
 

@@ -12,14 +12,13 @@ from scipy import linalg
 
 from docking.config.cell import CellFile
 from docking.config.job import Component, JobFile, Mate
-from docking.config.nominal import feature_points, mate_feature_points, target_points
+from docking.config.nominal import docked_in_mate, feature_points, mate_feature_points, target_points
 from docking.geometry import pose_from_vector
 from docking.pose.expected import Layout
 from docking.pose.features import specific_risk
 from docking.pose.layout import spread
 from docking.pose.least_squares import design, weighted_centroid
 from docking.pose.noise import NOISE_PRESETS, NoiseModel
-from docking.pose.svd import fit_svd
 from docking.pose.uncertainty import largest_sigma_mm, own_cov_mm2
 from docking.types import Array, Pose
 
@@ -66,9 +65,7 @@ def noise_of(cell: CellFile) -> NoiseModel:
 
 def docked_pose(cell: CellFile, job: JobFile) -> Pose:
     """Nominal X_WC with the component's features on those of the mate."""
-    component = feature_points(job.component, cell).xyz_mm
-    mate = mate_feature_points(job.component, job.mate, cell).xyz_mm
-    return pose_from_vector(job.mate.pose) @ fit_svd(component, mate)
+    return pose_from_vector(job.mate.pose) @ docked_in_mate(job, cell)
 
 
 def feature_budget(cell: CellFile, job: JobFile, passes: int) -> tuple[FeatureBudget, ...]:

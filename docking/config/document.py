@@ -175,6 +175,7 @@ def job_document_findings(doc: Document) -> list[Finding]:
         *duplicates(entries(doc, "component.features[].name"), "name"),
         *duplicates(entries(doc, "component.balls[].positioner"), "positioner"),
         *duplicates(entries(doc, "stages[].name"), "name"),
+        *duplicates(entries(doc, "goal_locks[]"), "degree of freedom"),
         *_stage_order(doc),
         *_start(doc),
         *_in_order(doc.get("measuring", {}), "passes", "max_passes", "measuring."),

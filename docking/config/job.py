@@ -113,6 +113,20 @@ class JobFile(Model):
     component: Component = Field(description="the part that moves")
     mate: Mate = Field(description="the part that stands")
     docking_axis: Vector3 = Field(description="unit vector of the insertion, in the mate frame M")
+    goal: Literal["least-squares", "minimax"] = Field(
+        default="least-squares",
+        description="how the docked pose is fitted to the features: least squares weighted by their tolerances, or the "
+        "smallest largest error in tolerances",
+    )
+    goal_locks: tuple[Literal["x", "y", "z", "alpha", "beta", "gamma"], ...] = Field(
+        default=(),
+        description="degrees of freedom that the features do not decide: shifts along, rotations about the axes of M "
+        "through the docking face; they stay as in docked_pose",
+    )
+    docked_pose: PoseVector | None = Field(
+        default=None,
+        description="X_MC as designed, mm and deg; by default the least-squares fit of the features' coordinates",
+    )
     stages: tuple[Stage, ...] = Field(
         min_length=1, description="stations of the approach, farthest first, the last at 0 mm"
     )

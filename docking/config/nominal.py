@@ -6,7 +6,9 @@ import numpy as np
 
 from docking.config.cell import CellFile, ErsPoint
 from docking.config.job import Component, JobFile, Mate, Target
-from docking.types import Array, Points
+from docking.geometry import pose_from_vector
+from docking.pose.goal import GoalRule, best_fit
+from docking.types import Array, Points, Pose
 
 
 def _scale(expansion_per_k: float, temperature_c: float, reference_c: float) -> float:
@@ -43,6 +45,20 @@ def mate_feature_points(component: Component, mate: Mate, cell: CellFile) -> Poi
 def ers_points(ers: tuple[ErsPoint, ...]) -> Points:
     """Reference points (n, 3) in W."""
     return Points(tuple(p.name for p in ers), np.array([p.xyz_mm for p in ers]), _isotropic([p.sigma_mm for p in ers]))
+
+
+def goal_rule(job: JobFile) -> GoalRule:
+    """How the docked pose follows from the features."""
+    docked = None if job.docked_pose is None else pose_from_vector(job.docked_pose)
+    return GoalRule(job.goal, job.goal_locks, docked, job.component.docking_face_mm)
+
+
+def docked_in_mate(job: JobFile, cell: CellFile) -> Pose:
+    """X_MC of the docked component by the features' nominal coordinates and the job's rule. Raises NotCongruent."""
+    component = feature_points(job.component, cell).xyz_mm
+    mate = mate_feature_points(job.component, job.mate, cell).xyz_mm
+    tolerance = np.array([feature.tolerance_mm for feature in job.component.features])
+    return best_fit(component, mate, tolerance, goal_rule(job))
 
 
 def measured_features(job: JobFile, cell: CellFile) -> tuple[Points, Points]:

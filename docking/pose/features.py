@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from docking.errors import CheckPointDisagrees, SigmaMissing
+from docking.pose.goal import Goal, GoalRule, goal_of
 from docking.pose.quantiles import chi2_upper
-from docking.pose.svd import fit_svd
 from docking.pose.uncertainty import joint_cov_mm2, largest_sigma_mm, own_cov_mm2
 from docking.types import Array, FeatureErrors, Fit, Points, Pose
 
@@ -119,14 +119,21 @@ def specific_risk(error_mm: Array, joint_mm2: Array, tolerance_mm: Array) -> flo
     return float(np.mean(np.any(outside, axis=1)))
 
 
-def goal_pose(component: Fit, mate: Fit, features: Features, standoff_W_mm: Array | None = None) -> Pose:
-    """Pose X_WC that brings the component's features onto the measured mate's, weighted by 1 / tolerance^2.
+def docked_goal(component: Fit, mate: Fit, features: Features, rule: GoalRule | None = None) -> Goal:
+    """The pose that brings the component's features onto the measured mate's, and what it leaves at each of them."""
+    rule = GoalRule() if rule is None else rule
+    return goal_of(component, mate, (features.component_mm, features.mate_mm, features.tolerance_mm), rule)
 
-    The component keeps the expansion that its fit found. `standoff_W_mm` (3,) is added to the goal's translation.
-    """
-    here = component.predict(features.component_mm)
-    body = component.X_MN.inverse().apply(here)
-    X_WC = fit_svd(body, mate.predict(features.mate_mm), features.tolerance_mm**-2.0)
+
+def goal_pose(
+    component: Fit,
+    mate: Fit,
+    features: Features,
+    standoff_W_mm: Array | None = None,
+    rule: GoalRule | None = None,
+) -> Pose:
+    """Pose X_WC of the docked goal, shifted by `standoff_W_mm` (3,). Without a rule: least squares, nothing locked."""
+    X_WC = docked_goal(component, mate, features, rule).X_WC
     shift = np.zeros(3) if standoff_W_mm is None else standoff_W_mm
     return Pose(X_WC.R, X_WC.t_mm + shift)
 

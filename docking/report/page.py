@@ -71,6 +71,7 @@ def view(run: Run, language: str) -> dict[str, Any]:
         "risk": tables.risk_row(last),
         "checks": tables.check_rows(run.last("check_points")),
         "measured_features": tables.measured_rows(run),
+        "goal": tables.goal_table(run),
         "set_aside": tables.set_aside_rows(run),
         "stages": tables.stage_rows(run),
         "fits": tables.fit_rows(run),

@@ -137,6 +137,16 @@ def measured_rows(run: Run) -> list[Row]:
     return [row for body in run.bodies("features_measured") for row in check_rows(body)]
 
 
+def goal_table(run: Run) -> Row | None:
+    """The goal of the last planned move: the rule, what is locked, and what it leaves at each feature."""
+    body = run.last("goal")
+    if not body:
+        return None
+    keys = zip(body.get("names") or (), body.get("misfit_mm") or (), body.get("share") or (), strict=False)
+    rows = [{"name": name, "misfit_mm": misfit, "percent": 100.0 * numeric(share)} for name, misfit, share in keys]
+    return {"rule": body.get("rule"), "locks": ", ".join(body.get("locks") or ()), "rows": rows}
+
+
 def set_aside_rows(run: Run) -> list[Row]:
     """Every check point that was set aside because it alone was grossly off."""
     keys = "name", "error_mm", "limit_mm"
