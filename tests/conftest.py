@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import os
+from collections.abc import Generator
 
 import pytest
 
@@ -12,6 +14,30 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--all-cells", action="store_true", help="dock the full-size cells over real wires too, in real time"
     )
     parser.addoption("--full", action="store_true", help="the full sets of cases that are marked so, not only a few")
+
+
+NO_SKIPS = bool(os.environ.get("CI"))
+"""In CI everything that a peer test needs is installed: one that is skipped has tested nothing."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(
+    collector: pytest.Collector,
+) -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    """A whole file of peers that is skipped fails in CI."""
+    report = yield
+    if NO_SKIPS and report.skipped and "peers" in collector.path.parts:
+        report.outcome = "failed"
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """A peer test that is skipped fails in CI."""
+    report = yield
+    if NO_SKIPS and report.skipped and item.get_closest_marker("peer") and not hasattr(report, "wasxfail"):
+        report.outcome = "failed"
+    return report
 
 
 @pytest.fixture

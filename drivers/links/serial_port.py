@@ -91,8 +91,10 @@ class SerialPort:
         self._thread.start()
 
     def _open_port(self) -> serial.Serial:
+        # pyserial's RFC 2217 client refuses a write time-out; its writes go to a socket that buffers.
+        write_wait_s = None if self._url.lower().startswith("rfc2217:") else WRITE_WAIT_S
         return serial.serial_for_url(
-            self._url, baudrate=self._baud, timeout=READ_WAIT_S, write_timeout=WRITE_WAIT_S, exclusive=True
+            self._url, baudrate=self._baud, timeout=READ_WAIT_S, write_timeout=write_wait_s, exclusive=True
         )
 
     def write(self, data: bytes) -> None:

@@ -41,7 +41,15 @@ def measure(path: str, checksum: bool) -> dict[str, Any]:
             result = station.tmc.get_simple_measurement(3)
             seen["point", face] = (result.error, result.params)
             seen["face", face] = int(station.tmc.get_face().params.value)
+            seen["full", face] = station.tmc.get_complete_measurement(3).params
+        seen["coordinate"] = station.tmc.get_coordinate(3).params
+        seen["air"] = station.tmc.set_atmospheric_corrections(0.658, 990.0, 21.0, 15.0).error
+        seen["air read"] = station.tmc.get_atmospheric_corrections().params
+        seen["prism"] = station.tmc.set_prism_correction(-0.0169).error
+        seen["prism read"] = station.tmc.get_prism_correction().params
         seen["unknown"] = station.request(4711).error
+        station.aut.turn_to(Angle(hz + 0.06), Angle(zenith))
+        seen["search"] = station.aut.search(Angle(0.2), Angle(0.05)).error
         station.aut.turn_to(Angle(hz + 1.0), Angle(zenith))
         seen["nothing"] = station.aut.fine_adjust(Angle(0.02), Angle(0.02)).error
     return seen
@@ -65,5 +73,15 @@ async def test_geocompy_measures_a_point_in_both_faces(checksum: bool) -> None:
         across = slope_m * math.sin(v_rad)
         found_m = (across * math.sin(hz_rad), across * math.cos(hz_rad), slope_m * math.cos(v_rad))
         np.testing.assert_allclose(found_m, np.array(POINTS["N1"]) / 1000.0, atol=1e-9)
+        full = seen["full", face]
+        assert [float(full[i]) for i in (0, 1)] == pytest.approx([hz_rad, v_rad], abs=1e-9)
+        assert (float(full[2]), full[6]) == (pytest.approx(2.4e-6), pytest.approx(slope_m, abs=1e-9))
+    point, taken_ms, again, _ = seen["coordinate"]
+    np.testing.assert_allclose((point.x, point.y, point.z), np.array(POINTS["N1"]) / 1000.0, atol=1e-9)
+    assert again == point
+    assert taken_ms == seen["full", 2][7] > seen["full", 1][7]
+    assert [int(seen[key]) for key in ("air", "prism", "search")] == [0, 0, 0]
+    assert seen["air read"] == pytest.approx((0.658, 990.0, 21.0, 15.0))
+    assert seen["prism read"] == pytest.approx(-0.0169)
     assert int(seen["unknown"]) == 3081
     assert int(seen["nothing"]) == 8710
