@@ -21,6 +21,8 @@ Say = Callable[[str], None]
 Post = Callable[[Event], None]
 Override = Callable[[float], None]
 
+LOOK_S = 0.5
+"""How often the terminal looks again at a wired input that is not given."""
 HOLD_S = 30.0
 """How long a relief step waits to be asked for; the supervisor has let go when the time is up."""
 
@@ -40,6 +42,9 @@ class AutomaticOperator:
 
     async def permissives(self, names: tuple[str, ...]) -> tuple[str, ...]:
         return ()
+
+    async def wait_for(self, name: str) -> bool:
+        return False
 
     async def confirm(self, plan: Plan, shown: dict[str, Any]) -> Event:
         return Event.CONFIRMED
@@ -69,6 +74,7 @@ class TerminalOperator:
         self._asked: frozenset[str] = frozenset()
         self._answer: asyncio.Future[str] | None = None
         self._engaged = self._gone = False
+        self._awaited = ""
         self._post: Post = lambda event: None
         self._override: Override = lambda percent: None
 
@@ -142,8 +148,19 @@ class TerminalOperator:
                 self.notify("not_yet", name=name)
         return ()
 
+    async def wait_for(self, name: str) -> bool:
+        """Say once that a wired input is waited for, then look again; an abort ends the run by itself."""
+        if self._awaited != name:
+            self._engaged, self._awaited = True, name
+            self.notify("waiting_for", name=name)
+            if self._gone:
+                self._leave()
+        await asyncio.sleep(LOOK_S)
+        return True
+
     async def confirm(self, plan: Plan, shown: dict[str, Any]) -> Event:
         """Wait for go, or for the choice to go back the way the component came; an abort ends the run by itself."""
+        self._awaited = ""
         if not shown.get("retreatable"):
             await self._ask(_GO, "go")
             return Event.CONFIRMED

@@ -11,7 +11,7 @@ from typing import Any, Protocol, TypeVar
 from docking.errors import DockingError, LinkError
 from docking.sightings import InertialSample, PointFrame
 from docking.state import Event
-from docking.types import Array, Feedback, Identity, MoveResult, Plan, Reading
+from docking.types import Array, Feedback, Identity, InputState, MoveResult, Plan, Reading
 
 
 class Tracker(Protocol):
@@ -172,6 +172,22 @@ class QueuedPositioners(Protocol):
     async def close(self) -> None: ...
 
 
+class Inputs(Protocol):
+    """Wired inputs beside the axes: contacts and temperatures. `on_change` is called when `latest` says something new."""
+
+    on_change: Callable[[], None]
+
+    async def bring_up(self) -> tuple[Identity, ...]:
+        """Prove every module, and wait until each has said what its inputs are."""
+        ...
+
+    def latest(self) -> InputState:
+        """What they say now, debounced."""
+        ...
+
+    async def close(self) -> None: ...
+
+
 class Motion(Protocol):
     """All the cell knows of motion: load a table, start it, hold, resume or stop on the path, see where it stands."""
 
@@ -214,6 +230,10 @@ class Motion(Protocol):
         """The newest read-back. Raises the fault that the motion side holds until it is reset."""
         ...
 
+    def inputs(self) -> InputState:
+        """What the wired inputs say, as last heard."""
+        ...
+
     async def close(self) -> None: ...
 
 
@@ -238,6 +258,10 @@ class Operator(Protocol):
 
     async def permissives(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """Ask for the named inputs; return those that are not given."""
+        ...
+
+    async def wait_for(self, name: str) -> bool:
+        """The wired input `name` is not given: True to look again, False when nobody is there who could give it."""
         ...
 
     async def confirm(self, plan: Plan, shown: dict[str, Any]) -> Event:

@@ -21,7 +21,6 @@ from docking.errors import (
     FitResidual,
     FrameImplausible,
     NotCongruent,
-    PermissiveMissing,
     PlanStale,
     TargetLost,
     TooFewPoints,
@@ -30,13 +29,14 @@ from docking.independent_points import IndependentPoints
 from docking.kinematics import Positioners, ball_reactions_n, figure_residual_mm, pose_from_axes, sink_mm
 from docking.motion.settle import SettleSettings, settle
 from docking.motion.weighing import weigh
+from docking.permissives import Permissives
 from docking.planning import Action, GuardSettings, PlanRequest, PlanSettings, check_correction, make_plan, retreat_plan
 from docking.ports import Journal, Motion, Operator
 from docking.pose import fit_pose, screen
 from docking.progress import Progress, stop_of
 from docking.state import Effect, Event
-from docking.survey import Survey
-from docking.types import Array, Fit, Plan, Pose
+from docking.survey import Nominals, Survey, SurveySettings
+from docking.types import Array, Fit, InputState, Plan, Pose
 
 START_TOLERANCE_MM = 0.05
 """How far an axis may stand from where its plan begins."""
@@ -47,7 +47,10 @@ UNSEEN = (TargetLost, TooFewPoints, DegenerateTargets)
 
 @dataclass(frozen=True, eq=False)
 class ProcedureSettings:
-    """What the procedure needs of the files, besides the stages' own settings."""
+    """What the procedure needs of the files, besides the stages' own settings.
+
+    `enabling` are the devices that a person holds in every move; `measured` says what the inputs change.
+    """
 
     positioners: Positioners
     plan: PlanSettings
@@ -62,6 +65,18 @@ class ProcedureSettings:
     rms_limit_mm: float | None
     plausibility_mm: float
     fit_age_s: float
+    enabling: tuple[str, ...] = ()
+    measured: Callable[[InputState], Measured | None] = lambda state: None
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """What temperature sensors change: nominal points, fits and geometry; `records` says by how much."""
+
+    nominals: Nominals
+    survey: SurveySettings
+    approach: Approach
+    records: tuple[dict[str, Any], ...]
 
 
 class Procedure:
@@ -79,6 +94,7 @@ class Procedure:
         self._settings, self._approach, self._survey = settings, approach, survey
         self.motion, self.journal, self.operator = motion, journal, operator
         self.progress = Progress()
+        self._permissives = Permissives(motion, journal, operator)
         self._unseen: DockingError | None = None
         self._independent = IndependentPoints(survey, journal, settings.target_residual_mm, self._set_aside)
         self.effects: dict[Effect, Callable[[], Awaitable[Event]]] = {
@@ -123,11 +139,24 @@ class Procedure:
         return Event.ENABLED
 
     async def _locate(self) -> Event:
+        self._take_temperatures()
         self.operator.notify("measuring_references")
         await self._survey.locate(self._settings.X_WT, self._settings.X_WM)
         station = _known(self._survey.X_WT, "station")
         self.operator.notify("located", count=len(station.names), rms_mm=station.rms_mm)
         return Event.FRAME_MEASURED
+
+    def _take_temperatures(self) -> None:
+        """Temperatures count from the first measurement on; what nobody measures is as the job states."""
+        changed = self._settings.measured(self.motion.inputs())
+        if changed is None:
+            return
+        self._survey.nominals, self._survey.settings = changed.nominals, changed.survey
+        self._approach = changed.approach
+        for record in changed.records:
+            read_c = record["read_c"]
+            self.journal.write("temperature", {**record, "read_c": read_c if np.isfinite(read_c) else None})
+            self.operator.notify("temperature", **record)
 
     async def _measure(self) -> Event:
         p = self.progress
@@ -291,14 +320,12 @@ class Procedure:
         ]
         self.operator.show(plan, shown)
         station = self._approach.stations[p.way[-1].stage] if back else self._station()
-        missing = await self.operator.permissives(station.permissives)
-        body = {"stage": station.name, "declared": [n for n in station.permissives if n not in missing]}
-        self.journal.write("permissives", {**body, "missing": list(missing)})
-        if missing:
-            raise PermissiveMissing(missing[0], value=station.name)
+        required = (*station.permissives, *self._settings.enabling)
+        p.plan = replace(plan, requires=required)
+        await self._permissives.require(required, station.name)
         answer = await self.operator.confirm(plan, shown)
-        goal, rule = self._approach.docked_goal(self._component_fit(), self._mate_fit()), self._approach.goal
-        self.journal.write("goal", records.goal_record(goal, rule, self._approach.features.names, station.name))
+        if answer is Event.CONFIRMED:
+            await self._permissives.again(required, station.name)
         self.journal.write("confirm", {"plan_hash": plan.plan_hash, "go": answer is Event.CONFIRMED})
         if answer is Event.CONFIRMED and not back and not (self._fit_age_s() <= self._settings.fit_age_s):
             self.operator.notify("stale", age_s=self._fit_age_s(), limit_s=self._settings.fit_age_s)

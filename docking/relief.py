@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from docking import records
-from docking.errors import DockingError, ForceRose, ForeignForce, NotRelieved, PermissiveMissing, PlanStale
+from docking.errors import DockingError, ForceRose, ForeignForce, NotRelieved, PlanStale
 from docking.kinematics import Positioners
 from docking.motion.settle import SettleSettings
 from docking.motion.weighing import weigh
+from docking.permissives import Permissives
 from docking.planning import PlanSettings
 from docking.planning.relief import ReliefSettings, Scales, StepRequest, Strain, Tare, Weighing, relief_plan
 from docking.ports import Journal, Motion, Operator
@@ -32,7 +33,7 @@ GUARD_READINGS, GUARD_PAUSE_S = 2, 0.02
 @dataclass(frozen=True, eq=False)
 class ReliefRun:
     """What a relief needs of the files and of who asks for it: `supervisor` by name, `tare` where one is known,
-    `permissives` to declare before the first step."""
+    `permissives` that must be given before the first step and during each."""
 
     positioners: Positioners
     plan: PlanSettings
@@ -74,6 +75,7 @@ class Relief:
         self.run, self._clock = run, clock
         self.motion, self.journal, self.operator = motion, journal, operator
         self.progress = ReliefProgress()
+        self._permissives = Permissives(motion, journal, operator)
         self.effects: dict[Effect, Callable[[], Awaitable[Event]]] = {
             Effect.CONNECT: self._connect,
             Effect.ENABLE: self._enable,
@@ -179,12 +181,7 @@ class Relief:
         raise NotRelieved("part", cause, value=strain.largest_n, limit=relief.target_n)
 
     async def _declare(self) -> None:
-        names = self.run.permissives
-        missing = await self.operator.permissives(names)
-        body = {"stage": "relief", "declared": [n for n in names if n not in missing], "missing": list(missing)}
-        self.journal.write("permissives", body)
-        if missing:
-            raise PermissiveMissing(missing[0], value="relief")
+        await self._permissives.require(self.run.permissives, "relief")
 
     def _next_plan(self, scales: Scales, strain: Strain, weighing: Weighing) -> Plan:
         run, p = self.run, self.progress
@@ -205,7 +202,7 @@ class Relief:
         if p.plan is None or p.strain is None:
             raise PlanStale("relief", "no step is planned")
         self.journal.write("intent", records.intent_record(p.plan), durable=True)
-        await self.motion.load(p.plan)
+        await self.motion.load(replace(p.plan, requires=self.run.permissives))
         result = await self._guarded(p.plan, p.strain)
         p.steps, p.commanded_mm, p.result = p.steps + 1, result.commanded_mm, result
         self.journal.write("moved", records.moved_record(p.plan, result))

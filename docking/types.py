@@ -245,7 +245,8 @@ class Plan(_Frozen):
     `t_s` (n,) path time on an even grid of `period_s`; `q_mm` (n, m) axis positions in the order of `axes`
     (driven and passive); `s` (n,) the scalar path coordinate 0..1. `plan_hash` identifies the content.
     `margins`: for each axis the least room to the stroke's margin (mm) and to its speed limit (mm/s).
-    `bounds` is what the pre-flight foresees, None only of a table that was not planned. `duration_s` is t_s[-1]. All
+    `bounds` is what the pre-flight foresees, None only of a table that was not planned. `requires` are the inputs that
+    have to be given while it runs, as far as they are wired. `duration_s` is t_s[-1]. All
     stops and holds change the rate at which path time runs, never the path.
     """
 
@@ -273,6 +274,7 @@ class Plan(_Frozen):
     def displacement_mm(self) -> Array:
         result: Array = self.q_mm[-1] - self.q_mm[0]
         return result
+    requires: tuple[str, ...] = ()
 
 
 class AxisState(Enum):
@@ -335,6 +337,20 @@ class Identity:
     product: str
     serial: str
     firmware: str
+@dataclass(frozen=True)
+class InputState:
+    """What the wired inputs of a cell say, by name.
+
+    `given`: True while the condition holds (given, pressed, closed), None where its module is silent. `temperature_c`
+    in deg C, NaN where the sensor says nothing. `silent` are the modules that are not heard. Empty where nothing is
+    wired.
+    """
+
+    given: dict[str, bool | None] = field(default_factory=dict)
+    temperature_c: dict[str, float] = field(default_factory=dict)
+    silent: tuple[str, ...] = ()
+
+
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,9 @@ logging.getLogger("pymodbus").setLevel(logging.CRITICAL + 1)
 
 CONNECT_S = 2.0
 MAX_READ, MAX_WRITE, MAX_EXCHANGE_WRITE = 125, 123, 121
-READ, WRITE, EXCHANGE = 3, 16, 23
+READ_BITS, READ, READ_INPUTS, WRITE, EXCHANGE = 2, 3, 4, 16, 23
+READS = (READ_BITS, READ, READ_INPUTS)
+MAX_BITS = 2000
 EXCEPTIONS = {
     1: "illegal function",
     2: "illegal register address",
@@ -98,6 +100,18 @@ class ModbusUnit:
         reply = await self._ask(READ, _SPAN.pack(address, count), 2 * count)
         return reply[1:]
 
+    async def read_inputs(self, address: int, count: int) -> bytes:
+        """Read `count` input registers (function 4)."""
+        _check(address, count, MAX_READ)
+        reply = await self._ask(READ_INPUTS, _SPAN.pack(address, count), 2 * count)
+        return reply[1:]
+
+    async def read_bits(self, address: int, count: int) -> bytes:
+        """Read `count` discrete inputs (function 2), eight a byte, the first in the lowest bit."""
+        _check(address, count, MAX_BITS)
+        reply = await self._ask(READ_BITS, _SPAN.pack(address, count), (count + 7) // 8)
+        return reply[1:]
+
     async def write(self, address: int, data: bytes) -> None:
         """Write registers as one block (function 16); the echoed span is checked."""
         count = len(data) // 2
@@ -136,7 +150,7 @@ class ModbusUnit:
         return data
 
     def _overdue(self, function: int) -> DeviceSilent | OutcomeUnknown:
-        if function == READ:
+        if function in READS:
             return DeviceSilent(self.where, f"{self._address} did not answer a read", limit=self._timeout_s)
         return OutcomeUnknown(self.where, f"No reply within {self._timeout_s} s.", value=f"write (function {function})")
 

@@ -44,6 +44,7 @@ class Plant:
         self._component = ComponentShape(cell, job, truth, draws)
         self._mate = MateShape(cell, job, truth, draws)
         self._temperatures = Temperatures(truth, draws)
+        self._stated_c = (job.component.temperature_c, job.mate.temperature_c, cell.temperature_c)
         mate_pose = offset_pose(pose_of(job.mate.pose), draws, "mate_pose", truth.mate_pose)
         self._mate_pose = DriftingPose(mate_pose, draws, "mate_creep", truth.mate_creep)
         self._down: Array = gravity_unit(cell)
@@ -194,6 +195,19 @@ class Plant:
         if self._epoch_s is None:
             self._epoch_s = self._t_s = t_s
         return max(0.0, t_s - self._epoch_s)
+
+    def temperatures_c(self, t_s: float) -> dict[str, float]:
+        """True temperatures, deg C: component and mate; the floor has the cell's reference temperature."""
+        component_k, mate_k = self._temperatures.excess_k(self.elapsed_s(t_s))
+        stated = self._stated_c
+        return {"component": stated[0] + component_k, "mate": stated[1] + mate_k, "floor": stated[2]}
+
+    def heat(self, part: str, by_k: float) -> None:
+        """Make component or mate warmer at once. Raises ValueError for anything else."""
+        if part not in ("component", "mate"):
+            raise ValueError(f"{part} is neither component nor mate")
+        self._temperatures.heat(by_k * (part == "component"), by_k * (part == "mate"))
+        self._stale_steps += 1
 
     def jam(self, axis: str) -> None:
         """Seize an axis mechanically. Raises ValueError for an unknown axis."""

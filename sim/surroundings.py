@@ -41,6 +41,10 @@ class Temperatures:
         self._offset_k = draws.uniform("temperature", (2,)) * truth.temperature.offset_k
         self._rate_k_s = draws.uniform("temperature", (2,)) * truth.temperature.rate_k_per_h / _HOUR_S
 
+    def heat(self, component_k: float, mate_k: float) -> None:
+        """Make them so much warmer at once."""
+        self._offset_k = self._offset_k + np.array((component_k, mate_k))
+
     def excess_k(self, elapsed_s: float) -> tuple[float, float]:
         """True temperature minus the job's: (component, mate)."""
         component, mate = self._offset_k + self._rate_k_s * elapsed_s

@@ -35,9 +35,9 @@ from docking.kinematics import Positioners
 from docking.motion.settle import SettleSettings
 from docking.ports import Aside, Journal, Motion, Operator, SerialLink, Tracker, at_once
 from docking.pose import Features, FitSettings
-from docking.procedure import Procedure, ProcedureSettings
+from docking.procedure import Measured, Procedure, ProcedureSettings
 from docking.survey import Nominals, Survey, SurveySettings
-from docking.types import Array
+from docking.types import Array, InputState
 from drivers.geocom_tracker import GeocomTracker
 from drivers.line_tracker import LineTracker
 
@@ -49,12 +49,14 @@ AGREEING_POINTS = 4
 
 @dataclass(frozen=True)
 class Company:
-    """Who a run works with: the journal, the operator, the clock of the loop, who works out what takes long."""
+    """Who a run works with: the journal, the operator, the clock of the loop, who works out what takes long; `step`
+    says that a person asks for every move."""
 
     journal: Journal
     operator: Operator
     clock: Callable[[], float]
     aside: Aside = at_once
+    step: bool = False
 
 
 def build_cell(
@@ -73,6 +75,8 @@ def build_cell(
         aside=company.aside,
     )
     settings = _procedure_settings(cell, job, positioners)
+    if company.step and cell.inputs is not None:
+        settings = replace(settings, enabling=cell.inputs.names("enabling-device"))
     approach = _approach(cell, job)
     return Cell(Procedure(settings, approach, survey, motion, company.journal, company.operator))
 
@@ -134,7 +138,18 @@ def _procedure_settings(cell: CellFile, job: JobFile, positioners: Positioners) 
         rms_limit_mm=job.rms_limit_mm,
         plausibility_mm=limits.frame_plausibility_mm,
         fit_age_s=limits.fit_age_s,
+        measured=lambda state: _measured(cell, job, state),
     )
+
+
+def _measured(cell: CellFile, job: JobFile, state: InputState) -> Measured | None:
+    """The same nominals, fits and geometry at the temperatures that sensors make of those that the job states."""
+    found = part_temperatures(cell, job, state.temperature_c)
+    if not found:
+        return None
+    warm = with_temperatures(job, found)
+    rows = tuple(vars(one) for one in found)
+    return Measured(_nominals(cell, warm), _survey_settings(cell, warm), _approach(cell, warm), rows)
 
 
 def _approach(cell: CellFile, job: JobFile) -> Approach:
@@ -155,5 +170,5 @@ def _approach(cell: CellFile, job: JobFile) -> Approach:
         face_C_mm=np.array(part.docking_face_mm),
         stations=tuple(Station(s.name, s.standoff_mm, s.speed_mm_s, s.permissives) for s in job.stages),
         convergence=convergence_settings(cell, job),
-    )
         goal=goal_rule(job),
+    )

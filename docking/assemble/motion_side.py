@@ -8,24 +8,68 @@ import math
 from docking.assemble.wires import Addresses
 from docking.config import CellFile, JobFile
 from docking.config.cell import ModbusBus
+from docking.config.inputs import InputsConfig, ModbusModule
 from docking.motion import QueuedMotion, StreamedMotion
 from docking.motion.channel import QueueChannel
+from docking.motion.guarded import GuardedMotion, InputRules
 from docking.motion.monitors import watch_from
 from docking.motion.remote import LeaseSettings, RemoteMotion
 from docking.motion.served import LocalMotion, ServedMotion, ServiceSettings
 from docking.ports import CanLink
+from drivers.canopen.io_module import CanIoModule
 from drivers.canopen.positioners import CanopenPositioners
+from drivers.canopen.shared import SharedCan
+from drivers.inputs import InputModule, WiredInputs
+from drivers.maps.objects import load_object_map
+from drivers.modbus_inputs import ModbusIoModule
 from drivers.modbus_positioners import ModbusPositioners
 
 
 def local_motion(cell: CellFile, job: JobFile, can: CanLink | None, modbus: Addresses | None) -> LocalMotion:
-    """What drives the axes, in the process that calls."""
+    """What drives the axes and reads the inputs, in the process that calls."""
+    inputs = cell.inputs
+    if inputs is None:
+        return _axes(cell, job, can, modbus)
+    shared = SharedCan(can) if can is not None else None
+    motion = _axes(cell, job, shared.end() if shared is not None else None, modbus)
+    modules = input_modules(inputs, shared, modbus)
+    return GuardedMotion(motion, WiredInputs(inputs, modules), input_rules(inputs))
+
+
+def _axes(cell: CellFile, job: JobFile, can: CanLink | None, modbus: Addresses | None) -> LocalMotion:
     watch = watch_from(cell, job)
     if isinstance(cell.bus, ModbusBus):
         return QueuedMotion(ModbusPositioners(cell, modbus), watch, cell.bus.poll_s)
     if can is None:
         raise ValueError("a CANopen cell needs the near end of its bus")
     return StreamedMotion(CanopenPositioners(cell, can), watch, cell.limits.tick_late_cycles)
+
+
+def input_modules(inputs: InputsConfig, shared: SharedCan | None, modbus: Addresses | None) -> dict[str, InputModule]:
+    """The drivers of the modules, by name; CANopen ones on the bus that `shared` deals out."""
+    modules: dict[str, InputModule] = {}
+    words = load_object_map("cia402").abort_text
+    for module in inputs.modules:
+        if isinstance(module, ModbusModule):
+            modules[module.name] = ModbusIoModule(module, (modbus or {}).get(module.name))
+        elif shared is not None:
+            end = shared.end(CanIoModule.cobs(module))
+            modules[module.name] = CanIoModule(module, end, words)
+    return modules
+
+
+def input_rules(inputs: InputsConfig) -> InputRules:
+    """What the motion side does about each input."""
+    of_axes = {
+        use: {item.name: item.axis for item in inputs.digital if item.use == use and item.axis is not None}
+        for use in ("limit-switch", "brake-closed")
+    }
+    return InputRules(
+        emergency=inputs.names("emergency-stop"),
+        protective=inputs.names("protective-stop"),
+        limits=of_axes["limit-switch"],
+        brakes=of_axes["brake-closed"],
+    )
 
 
 def service_settings(cell: CellFile) -> ServiceSettings:

@@ -50,13 +50,14 @@ def build_relief(
     """The controller of one stress relief: the axes and no instrument."""
     cell, job = files.cell, files.job
     settle = cell.settle
+    enabling = cell.inputs.names("enabling-device") if cell.inputs is not None else ()
     run = ReliefRun(
         positioners=positioners_from(cell, job),
         plan=plan_settings(cell, job),
         relief=relief_settings(cell),
         settle=SettleSettings(settle.window_s, settle.readings, settle.tolerance_mm, settle.timeout_s),
         period_s=plan_period_s(cell),
-        permissives=job.stages[0].permissives,
+        permissives=(*job.stages[0].permissives, *enabling),
         supervisor=supervisor,
         tare=tare,
     )

@@ -20,6 +20,7 @@ from docking.assemble.simulated import FarEnd, make_far_end, real_wires, truth_o
 from docking.assemble.spawned import MotionProcess
 from docking.cell import Cell
 from docking.config import CellFile, JobFile
+from docking.config.inputs import ModbusModule
 from docking.config.load import default_job_path, file_sha256, load_cell, load_job
 from docking.errors import BadArgument, FileUnreadable, FileUnwritable
 from docking.journal import JournalFile, read
@@ -126,7 +127,7 @@ def run_on_wires(request: RunRequest, choice: WireChoice, say: Say, *, step: boo
             wires = Wires(SerialPort(found.get("tracker", files.cell.tracker.port), files.cell.tracker.baud))
             joined = _Joined(process, found)
             try:
-                return await _dock(_Run(files, request, wires, operator, path, far, choice.sim, joined))
+                return await _dock(_Run(files, request, wires, operator, path, far, choice.sim, joined, step))
             finally:
                 if far is not None:
                     await far.close()
@@ -187,6 +188,7 @@ class _Run:
     far: FarEnd | None
     simulated: bool
     joined: _Joined | None = None
+    step: bool = False
 
 
 async def _dock(run: _Run) -> dict[str, Any]:
@@ -196,7 +198,7 @@ async def _dock(run: _Run) -> dict[str, Any]:
     journal = JournalFile(run.journal_path, loop.time)
     try:
         journal.write("run_started", _started(run), durable=True)
-        company = Company(journal, run.operator, loop.time, aside if run.joined else at_once)
+        company = Company(journal, run.operator, loop.time, aside if run.joined else at_once, run.step)
         motion = await _joined_motion(run, run.joined, journal) if run.joined else None
         cell = build_cell(run.files.cell, run.files.job, run.wires, company, motion)
         run.operator.attend(cell.post, cell.override)
@@ -369,11 +371,12 @@ def read_wires(path: Path, cell: CellFile) -> dict[str, Any]:
         raise FileUnreadable(str(path), f"not JSON: {error}") from error
     if not isinstance(found, dict) or found.get("cell") != cell.name:
         raise BadArgument("--wires", f"the file is not for cell {cell.name}", value=str(path))
-    if cell.bus.kind == "modbus-tcp":
-        listed = found.get("modbus")
-        whole = isinstance(listed, dict) and set(listed) == {p.name for p in cell.positioners}
-    else:
-        whole = isinstance(found.get("can"), str)
+    modules = cell.inputs.modules if cell.inputs is not None else ()
+    expected = {module.name for module in modules if isinstance(module, ModbusModule)}
+    queued = cell.bus.kind == "modbus-tcp"
+    expected |= {p.name for p in cell.positioners} if queued else set()
+    listed = found.get("modbus", {})
+    whole = isinstance(listed, dict) and set(listed) == expected and (queued or isinstance(found.get("can"), str))
     _refuse_real_devices(path, found)
     if not (whole and isinstance(found.get("tracker"), str)):
         cause = "the file lacks addresses of this cell; let `docking sim` write it"

@@ -12,11 +12,15 @@ import numpy as np
 from docking.assemble.controller import Wires
 from docking.config import CellFile, JobFile
 from docking.config.cell import CanBus, ModbusBus
+from docking.config.inputs import CanModule, ModbusModule
 from sim.canopen.group import DriveGroup
+from sim.canopen.io_module import IoModule
 from sim.canopen.settings import DriveSettings
+from sim.input_world import InputWorld
 from sim.instrument import Instrument
 from sim.plant import Plant
 from sim.plc.group import PlcGroup
+from sim.plc.io_module import IoRegisters, IoServer
 from sim.trace import AxisTrace
 from sim.tracker.geocom import GeocomStation
 from sim.tracker.line import LineTrackerDevice
@@ -24,9 +28,12 @@ from sim.truth import TruthFile, load_truth
 from sim.wires.can_frames import CanEnd
 from sim.wires.pacing import DeviceEnd
 from sim.wires.pty_serial import PtySerial
+from sim.wires.shared_end import SharedEnd
 from sim.wires.unix_can import UnixCanServer
 from sim.wires.virtual_can import VirtualCan
 from sim.wires.virtual_serial import VirtualSerial
+
+LOCAL = "127.0.0.1"
 
 
 def truth_path(cell_path: Path) -> Path:
@@ -41,13 +48,15 @@ def truth_of(cell_path: Path) -> TruthFile:
 
 @dataclass
 class FarEnd:
-    """The simulated devices of one cell. `plant` is the truth; `devices` are held so that they live."""
+    """The simulated devices of one cell. `plant` is the truth, `world` what the inputs are wired to; `devices` are held
+    so that they live."""
 
     plant: Plant
     instrument: Instrument
     truth: TruthFile
     loop: asyncio.AbstractEventLoop
     seed: int
+    world: InputWorld
     devices: list[Any] = field(default_factory=list)
 
     def tracker(self, cell: CellFile, wire: DeviceEnd) -> None:
@@ -64,9 +73,16 @@ class FarEnd:
             shared_cpu=shared_cpu,
             watchdog_scatter_s=drives.watchdog_scatter_s,
         )
-        group = DriveGroup(self.plant, cell, settings, wire, self.loop)
+        modules = [m for m in cell.inputs.modules if isinstance(m, CanModule)] if cell.inputs else []
+        shared = SharedEnd(wire)
+        # A bus of drives alone keeps its own end: every frame would pass one more pair of hands.
+        group = DriveGroup(self.plant, cell, settings, shared.station() if modules else wire, self.loop)
         group.start()
         self.devices.append(group)
+        for module in modules:
+            device = IoModule(module.name, module.node, self.world, shared.station(), self.loop)
+            device.start()
+            self.devices.append(device)
 
     async def plcs(self, cell: CellFile, addresses: dict[str, tuple[str, int]] | None) -> dict[str, tuple[str, int]]:
         """Let the positioner PLCs listen; return their addresses."""
@@ -75,7 +91,17 @@ class FarEnd:
         late_s = np.random.default_rng([self.seed, len(names)]).uniform(0.0, skew_s, len(names)).tolist()
         group = PlcGroup(self.plant, cell, [self.plant.clock_ppm[n] for n in names], self.loop, late_s)
         self.devices.append(group)
-        return await group.serve(addresses)
+        return {**await group.serve(addresses), **await self.modbus_inputs(cell, LOCAL if addresses else None)}
+
+    async def modbus_inputs(self, cell: CellFile, host: str | None = None) -> dict[str, tuple[str, int]]:
+        """Let the Modbus I/O modules listen, at the addresses of the cell or at free ports of `host`."""
+        modules = [m for m in cell.inputs.modules if isinstance(m, ModbusModule)] if cell.inputs else []
+        found = {}
+        for module in modules:
+            server = IoServer(IoRegisters(module.name, self.world, self.loop.time), module.unit)
+            self.devices.append(server)
+            found[module.name] = await server.serve(*((host, 0) if host else (module.host, module.port)))
+        return found
 
     def trace(self, path: Path) -> None:
         """Record where the axes are commanded and where they stand. Raises OSError."""
@@ -94,7 +120,9 @@ class FarEnd:
 def make_far_end(cell: CellFile, job: JobFile, truth: TruthFile, seed: int) -> FarEnd:
     """Plant and instrument of one seed; call on the loop that will run them."""
     plant = Plant(cell, job, truth, seed)
-    return FarEnd(plant, Instrument(plant, cell, truth, seed), truth, asyncio.get_running_loop(), seed)
+    loop = asyncio.get_running_loop()
+    world = InputWorld(cell, plant, loop, seed)
+    return FarEnd(plant, Instrument(plant, cell, truth, seed), truth, loop, seed, world)
 
 
 async def virtual_wires(cell: CellFile, far: FarEnd) -> Wires:
@@ -106,7 +134,7 @@ async def virtual_wires(cell: CellFile, far: FarEnd) -> Wires:
         far_end = bus.end()
         await far_end.open()
         far.drives(cell, far_end)
-        return Wires(serial.near, can=bus.end())
+        return Wires(serial.near, can=bus.end(), modbus=await far.modbus_inputs(cell))
     return Wires(serial.near, modbus=await far.plcs(cell, None))
 
 
@@ -118,7 +146,7 @@ async def real_wires(cell: CellFile, far: FarEnd, folder: Path) -> dict[str, Any
     far.devices.append(serial)
     found: dict[str, Any] = {"cell": cell.name, "tracker": serial.path}
     if isinstance(cell.bus, ModbusBus):
-        addresses = {p.name: ("127.0.0.1", 0) for p in cell.positioners}
+        addresses = {p.name: (LOCAL, 0) for p in cell.positioners}
         found["modbus"] = {name: list(at) for name, at in (await far.plcs(cell, addresses)).items()}
         return found
     bus = UnixCanServer(folder / "can.sock")
@@ -126,4 +154,7 @@ async def real_wires(cell: CellFile, far: FarEnd, folder: Path) -> dict[str, Any
     far.drives(cell, bus, shared_cpu=True)
     far.devices.append(bus)
     found["can"] = str(bus.path)
+    beside = {name: list(at) for name, at in (await far.modbus_inputs(cell, LOCAL)).items()}
+    if beside:
+        found["modbus"] = beside
     return found

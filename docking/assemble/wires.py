@@ -14,7 +14,7 @@ Addresses = dict[str, tuple[str, int]]
 
 @dataclass(frozen=True)
 class Wires:
-    """The near ends of a cell's wires: a serial line, and a CAN bus or the addresses of the positioner PLCs."""
+    """The near ends of a cell's wires: a serial line, a CAN bus, the addresses of positioner PLCs and Modbus inputs."""
 
     serial: SerialLink
     can: CanLink | None = None
@@ -22,10 +22,12 @@ class Wires:
 
 
 def near_bus(cell: CellFile, found: dict[str, Any]) -> tuple[CanLink | None, Addresses | None]:
-    """The positioners' wire: a CAN bus, or the addresses of PLCs (None: those of the cell file)."""
+    """The positioners' wire: a CAN bus, or the addresses of PLCs; with those of Modbus inputs (None: as in the cell
+    file)."""
+    listed = found.get("modbus")
+    addresses = {name: (str(host), int(port)) for name, (host, port) in listed.items()} if listed else None
     if cell.bus.kind == "modbus-tcp":
-        listed = found.get("modbus")
-        return None, {name: (str(host), int(port)) for name, (host, port) in listed.items()} if listed else None
+        return None, addresses
     if "can" in found:
-        return CanBusLink("docking-unix", found["can"], cell.bus.bitrate), None
-    return CanBusLink(cell.bus.interface, cell.bus.channel, cell.bus.bitrate), None
+        return CanBusLink("docking-unix", found["can"], cell.bus.bitrate), addresses
+    return CanBusLink(cell.bus.interface, cell.bus.channel, cell.bus.bitrate), addresses

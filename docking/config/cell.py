@@ -7,6 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from docking.config.base import Finite, Fraction, Model, Name, NonNegative, PoseVector, Positive, Vector3
+from docking.config.inputs import InputsConfig
 from docking.config.instruments import GeocomConfig
 
 
@@ -320,6 +321,9 @@ class CellFile(Model):
     settle: SettleConfig = Field(default=SettleConfig(), description="standstill before measuring")
     motion: MotionConfig = Field(default=MotionConfig(), description="the process that moves the axes")
     permissives: tuple[Name, ...] = Field(default=(), description="named inputs the cell offers")
+    inputs: InputsConfig | None = Field(
+        default=None, description="inputs that are wired; without them the operator declares the permissives"
+    )
 
     @property
     def axis_names(self) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from docking.config.budget import REMEDIES, FeatureBudget, feature_budget, least
 from docking.config.cell import CellFile, PositionerConfig
 from docking.config.document import cell_document_findings, job_document_findings
 from docking.config.findings import Finding, error, errors_of, warning
+from docking.config.input_checks import input_findings
 from docking.config.job import JobFile, Target
 from docking.config.nominal import docked_in_mate, feature_points, mate_feature_points
 from docking.config.support import (
@@ -38,7 +39,7 @@ ADVISED_SPREAD = 0.05
 def check_cell(cell: CellFile) -> list[Finding]:
     """All findings about a cell, errors and warnings, in the order of the file."""
     findings = [*_ers(cell), *_unit("gravity_direction", cell.gravity_direction, 1e-3)]
-    findings += cell_document_findings(cell.model_dump())
+    findings += cell_document_findings(cell.model_dump()) + input_findings(cell)
     axes = list(chain.from_iterable(_directions(i, p) for i, p in enumerate(cell.positioners)))
     findings += axes
     if not errors_of(axes):

@@ -12,7 +12,7 @@ from typing import Any, cast
 from docking.errors import BadArgument, DockingError, MotionProcessLost, PlanStale
 from docking.motion.channel import Channel
 from docking.motion.messages import WHERE, decode, encode
-from docking.types import Array, Feedback, Identity, MoveResult, Plan
+from docking.types import Array, Feedback, Identity, InputState, MoveResult, Plan
 
 RENEWALS = 5
 """How often the lease is renewed in its time."""
@@ -55,6 +55,7 @@ class RemoteMotion:
         self._move = 0
         self._early: list[str] = []
         self._feedback: Feedback | None = None
+        self._inputs = InputState()
         self._held: DockingError | None = None
         self._lost: DockingError | None = None
         self._timer: asyncio.TimerHandle | None = None
@@ -116,6 +117,10 @@ class RemoteMotion:
             raise PlanStale("motion", "the positioners are not enabled")
         return self._feedback
 
+    def inputs(self) -> InputState:
+        """What the wired inputs say, as last told; told at every change."""
+        return self._inputs
+
     async def close(self) -> None:
         try:
             if self._lost is None:
@@ -166,6 +171,8 @@ class RemoteMotion:
                 self._feedback = replace(self._feedback, t_s=payload)
         elif kind == "feedback":
             self._feedback, self._held = payload, None
+        elif kind == "inputs":
+            self._inputs = payload
         elif kind == "held":
             self._held = payload
         elif kind in ("reply", "failed"):

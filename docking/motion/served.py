@@ -10,7 +10,7 @@ import asyncio
 import traceback
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, fields
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from docking.errors import BadReply, DockingError, LeaseLost
 from docking.motion.arbiter import Arbiter
@@ -18,7 +18,7 @@ from docking.motion.channel import Channel
 from docking.motion.lateness import Lateness, speed_limit_mm_s
 from docking.motion.messages import WHERE, decode, encode
 from docking.motion.triggers import Finding, Trigger
-from docking.types import Array, Feedback, Identity, MoveResult, Plan
+from docking.types import Array, Feedback, Identity, InputState, MoveResult, Plan
 
 STOP_S = 30.0
 """Longest wait for a move to stop on its path before the wires are released without it."""
@@ -29,7 +29,11 @@ class LocalMotion(Protocol):
     """What is served: a motion side that drives the positioners in this process, as `docking.ports.Motion` says."""
 
     axes: tuple[str, ...]
-    arbiter: Arbiter
+
+    @property
+    def arbiter(self) -> Arbiter:
+        """Decides and keeps what stops the axes."""
+        ...
 
     async def connect(self) -> tuple[Identity, ...]: ...
 
@@ -52,6 +56,13 @@ class LocalMotion(Protocol):
     def feedback(self) -> Feedback: ...
 
     async def close(self) -> None: ...
+
+
+@runtime_checkable
+class WithInputs(Protocol):
+    """A motion side that tells what its wired inputs say."""
+
+    on_inputs: Callable[[InputState], None]
 
 
 @dataclass(frozen=True)
@@ -93,6 +104,8 @@ class ServedMotion:
         self.ended = asyncio.Event()
         channel.on_message, channel.on_lost = self._take, self._lost
         motion.arbiter.on_latched = self._latched
+        if isinstance(motion, WithInputs):
+            motion.on_inputs = lambda state: self._send("inputs", 0, state)
 
     # what comes in -------------------------------------------------------------------------------------------------
     def _take(self, message: bytes) -> None:

@@ -1,20 +1,29 @@
-"""SDO server of one simulated drive: expedited and segmented transfers, aborts."""
+"""SDO server of one simulated node: expedited and segmented transfers, aborts."""
 
 from __future__ import annotations
 
 import struct
+from typing import Protocol
 
-from sim.canopen.dictionary import Abort, Dictionary
+from sim.canopen.dictionary import Abort
 
 _TOGGLE = 0x0503_0000
 _UNKNOWN_COMMAND = 0x0504_0001
 _LENGTH = 0x0607_0010
 
 
+class Objects(Protocol):
+    """An object dictionary; both methods may raise Abort."""
+
+    def read(self, index: int, sub: int) -> bytes: ...
+
+    def write(self, index: int, sub: int, data: bytes) -> None: ...
+
+
 class SdoServer:
     """Answers one request frame (8 bytes) at a time."""
 
-    def __init__(self, dictionary: Dictionary) -> None:
+    def __init__(self, dictionary: Objects) -> None:
         self._dictionary = dictionary
         self._address = (0, 0)
         self._sending = b""

@@ -1,7 +1,8 @@
 """A Modbus TCP server as a PLC has it: pipelined requests, exceptions, unit ids.
 
 Frame: transaction u16, protocol u16 = 0, length u16, unit u8, function u8, data; all big-endian.
-Functions 3, 4 (read), 6, 16 (write), 23 (write, then read) on one table of holding registers a unit.
+Functions 3, 4 (read), 6, 16 (write), 23 (write, then read) on one table of registers a unit; function 2 (read bits)
+where the unit has discrete inputs.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import struct
 from collections.abc import Mapping
-from typing import Protocol, cast
+from typing import Protocol, cast, runtime_checkable
 
 _HEADER = struct.Struct(">HHHBB")
 _SPAN = struct.Struct(">HH")
@@ -17,7 +18,7 @@ _WRITE = struct.Struct(">HHB")
 _READ_WRITE = struct.Struct(">HHHHB")
 
 ILLEGAL_FUNCTION, ILLEGAL_ADDRESS, ILLEGAL_VALUE, NO_SUCH_UNIT = 1, 2, 3, 11
-MAX_READ, MAX_WRITE, MAX_READ_WRITE = 125, 123, 121
+MAX_READ, MAX_WRITE, MAX_READ_WRITE, MAX_BITS = 125, 123, 121, 2000
 
 
 class ModbusRefusal(Exception):
@@ -40,6 +41,18 @@ class RegisterDevice(Protocol):
         ...
 
 
+@runtime_checkable
+class ContactDevice(Protocol):
+    """A unit with discrete inputs; it may be cut off, so that nothing answers for it."""
+
+    @property
+    def answers(self) -> bool: ...
+
+    def bits(self, address: int, count: int) -> bytes:
+        """`count` discrete inputs from `address`, eight a byte, the first in the lowest bit."""
+        ...
+
+
 def _checked(count: int, most: int) -> int:
     if not 1 <= count <= most:
         raise ModbusRefusal(ILLEGAL_VALUE)
@@ -56,6 +69,14 @@ def _payload(body: bytes, start: int, count: int, declared: int) -> bytes:
 def _read(device: RegisterDevice, body: bytes) -> bytes:
     address, count = _SPAN.unpack(body)
     data = device.read(address, _checked(count, MAX_READ))
+    return bytes((len(data),)) + data
+
+
+def _read_bits(device: RegisterDevice, body: bytes) -> bytes:
+    if not isinstance(device, ContactDevice):
+        raise ModbusRefusal(ILLEGAL_FUNCTION)
+    address, count = _SPAN.unpack(body)
+    data = device.bits(address, _checked(count, MAX_BITS))
     return bytes((len(data),)) + data
 
 
@@ -79,7 +100,7 @@ def _read_write(device: RegisterDevice, body: bytes) -> bytes:
     return bytes((len(data),)) + data
 
 
-_FUNCTIONS = {3: _read, 4: _read, 6: _write_one, 16: _write, 23: _read_write}
+_FUNCTIONS = {2: _read_bits, 3: _read, 4: _read, 6: _write_one, 16: _write, 23: _read_write}
 
 
 def answer(units: Mapping[int, RegisterDevice], unit: int, function: int, body: bytes) -> bytes:
@@ -131,8 +152,10 @@ class ModbusTcpConnection(asyncio.Protocol):
             end = at + 6 + length
             if end > len(buffer):
                 break
-            reply = answer(self._units, unit, function, buffer[at + 8 : end])
-            replies.append(struct.pack(">HHHB", transaction, 0, len(reply) + 1, unit) + reply)
+            device = self._units.get(unit)
+            if not isinstance(device, ContactDevice) or device.answers:
+                reply = answer(self._units, unit, function, buffer[at + 8 : end])
+                replies.append(struct.pack(">HHHB", transaction, 0, len(reply) + 1, unit) + reply)
             at = end
         self._buffer = buffer[at:]
         if replies:

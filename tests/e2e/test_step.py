@@ -14,7 +14,7 @@ import pytest
 from docking.config.job import Stage
 from docking.config.load import load_cell, load_job
 from docking.journal import read
-from tests.support.program import Terminal, quick_cell
+from tests.support.program import Terminal, quick_cell, unwired
 
 pytestmark = [pytest.mark.wires, pytest.mark.timeout(120)]
 
@@ -25,7 +25,7 @@ FEATURES = ("upper-right", "lower-right", "upper-left", "lower-left")
 
 @pytest.fixture
 def cell(tmp_path: Path) -> Path:
-    return quick_cell(tmp_path, "lab-can")
+    return unwired(quick_cell(tmp_path, "lab-can"))
 
 
 def step(cell: Path, language: str = "en") -> Terminal:

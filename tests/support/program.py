@@ -42,6 +42,14 @@ def quick_cell(folder: Path, name: str) -> Path:
     return cell_copy(folder, name, (".sim.toml", "measure_s = 0.1", "measure_s = 0.01"))
 
 
+def unwired(cell: Path) -> Path:
+    """The same cell without its inputs: the operator declares every permissive."""
+    text = cell.read_text("utf-8")
+    begin, end = text.index("\n[inputs]"), text.index("\n[load_cells]")
+    cell.write_text(text[:begin] + text[end:], "utf-8")
+    return cell
+
+
 def on_an_ordinary_computer(folder: Path, name: str) -> Path:
     """A full-size cell whose controller and simulated devices may wait for the CPU, as the laboratory cells' may.
 

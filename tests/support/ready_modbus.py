@@ -57,7 +57,7 @@ class ReadyModbus:
         cell = load_cell(CELLS / f"{scene.name}.toml")
         bus = cell.bus.model_copy(update=dict(scene.bus))
         limits = cell.limits.model_copy(update={"missing_cycles": 2})
-        self.cell: CellFile = cell.model_copy(update={"bus": bus, "limits": limits})
+        self.cell: CellFile = cell.model_copy(update={"bus": bus, "limits": limits, "inputs": None})
         job = load_job(CELLS / f"{scene.name}.job.toml", cell)
         self.positioners = positioners_from(self.cell, job)
         truth = truth_of(CELLS / f"{scene.name}.toml")

@@ -1,0 +1,88 @@
+"""The inputs of a cell: modules on its wires, and what each of their channels means."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from docking.config.base import Finite, Model, Name, NonNegative, Positive
+
+Use = Literal[
+    "permissive", "emergency-stop", "protective-stop", "enabling-device", "limit-switch", "brake-closed"
+]
+AxisName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_\-]{0,31}\.[XYZ]$")]
+Channel = Annotated[int, Field(ge=0, le=255)]
+
+
+class CanModule(Model):
+    """A CANopen I/O module (CiA 401) on the positioners' bus."""
+
+    kind: Literal["cia401"] = Field(description="CANopen I/O module on the positioners' bus")
+    name: Name = Field(description="of the module")
+    node: Annotated[int, Field(ge=1, le=127)] = Field(description="CANopen node id")
+    refresh_s: Annotated[float, Field(ge=0.01, le=1.0)] = Field(
+        default=0.05, description="the module repeats its inputs so often, and at every change, s"
+    )
+    map: str = Field(default="cia401", description="object map in drivers/maps")
+
+
+class ModbusModule(Model):
+    """Discrete inputs and input registers behind a Modbus TCP address."""
+
+    kind: Literal["modbus-io"] = Field(description="Modbus TCP I/O module")
+    name: Name = Field(description="of the module; not that of a positioner")
+    host: str = Field(description="Modbus TCP address")
+    port: Annotated[int, Field(ge=1, le=65535)] = Field(default=502, description="Modbus TCP port")
+    unit: Annotated[int, Field(ge=1, le=247)] = Field(default=1, description="Modbus unit id")
+    poll_s: Annotated[float, Field(ge=0.01, le=1.0)] = Field(default=0.05, description="period of the polls, s")
+    timeout_s: Annotated[float, Field(ge=0.01, le=2.0)] = Field(
+        default=0.05, description="longest time one reply may take, s"
+    )
+    map: str = Field(default="modbus_io", description="register map in drivers/maps")
+
+
+class DigitalInput(Model):
+    """One contact. A module that is silent gives nothing, whatever the level."""
+
+    name: Name = Field(description="of the condition; for a permissive, its name in permissives")
+    use: Use = Field(default="permissive", description="what the contact means")
+    module: Name = Field(description="name of the module")
+    channel: Channel = Field(description="number of the input, from 0")
+    on: Literal["high", "low"] = Field(
+        default="high", description="level at which it is given, pressed, asked for or closed"
+    )
+    debounce_s: Annotated[float, Field(ge=0.0, le=1.0)] = Field(
+        default=0.02, description="a level counts once it has lasted so long, s"
+    )
+    axis: AxisName | None = Field(default=None, description="whose limit switch or brake it is")
+
+
+class TemperatureInput(Model):
+    """One temperature sensor."""
+
+    name: Name = Field(description="of the sensor")
+    of: Literal["component", "mate", "floor"] = Field(description="what it is fixed to")
+    module: Name = Field(description="name of the module")
+    channel: Channel = Field(description="number of the analogue input, from 0")
+    celsius_per_count: Positive = Field(default=0.1, description="scale of the input, deg C a count")
+    offset_c: Finite = Field(default=0.0, description="deg C at 0 counts")
+    sigma_k: Positive = Field(default=0.2, description="of the sensor and of its place, 1 sigma, K")
+    missing_sigma_k: NonNegative = Field(
+        default=1.0, description="added (root of the squares) to the job's temperature_sigma_k where it says nothing, K"
+    )
+
+
+Module = Annotated[CanModule | ModbusModule, Field(discriminator="kind")]
+
+
+class InputsConfig(Model):
+    """Wired inputs; permissives that are not wired are declared by the operator."""
+
+    modules: tuple[Module, ...] = Field(min_length=1, description="what the inputs are wired to")
+    digital: tuple[DigitalInput, ...] = Field(default=(), description="contacts")
+    temperatures: tuple[TemperatureInput, ...] = Field(default=(), description="temperature sensors")
+
+    def names(self, *uses: Use) -> tuple[str, ...]:
+        """Names of the contacts with one of these uses."""
+        return tuple(item.name for item in self.digital if item.use in uses)
