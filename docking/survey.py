@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from docking.calibration.station import ReferenceShift, locate_station, reference_shift, to_world
+from docking.calibration.two_face import face_errors
 from docking.errors import DeviceSilent, StationMoved, TargetLost, TwoFaceDisagrees
 from docking.ports import Aside, Journal, Tracker, at_once
 from docking.pose import FitSettings, fit_pose, screen
@@ -170,9 +171,13 @@ class Survey:
         gap = float(np.linalg.norm(one.p_T_mm - two.p_T_mm))
         sigma = float(np.sqrt(np.trace(one.cov_mm2 + two.cov_mm2)))
         limit = max(self.settings.two_face_limit_mm, self.settings.drift_sigmas * sigma)
-        self.journal.write("two_face", {"target": one.target, "difference_mm": gap, "limit_mm": limit})
+        found = face_errors(one.p_T_mm, two.p_T_mm, one.cov_mm2 + two.cov_mm2)
+        words = found.words(self.settings.drift_sigmas)
+        parts = {"collimation_urad": 1e6 * found.collimation_rad, "index_urad": 1e6 * found.index_rad}
+        body = {"target": one.target, "difference_mm": gap, "limit_mm": limit, **parts, "range_mm": found.range_mm}
+        self.journal.write("two_face", {**body, "words": words})
         if not (gap <= limit):
-            raise TwoFaceDisagrees(one.target, value=gap, limit=limit)
+            raise TwoFaceDisagrees(one.target, words, value=gap, limit=limit)
 
     async def _measure_W(self, group: str, nominal: Points, X_WN: Pose, passes: int) -> Points:
         X_WT = self._station()
