@@ -25,6 +25,7 @@ from docking.errors import (
     DriveFault,
     FeedbackMissing,
     LinkLost,
+    MotionError,
     ReadBackMismatch,
     WrongIdentity,
 )
@@ -39,7 +40,7 @@ POLL_S, TIMEOUT_S, SCAN_S = 0.05, 0.05, 0.01
 MISSING_CYCLES = 2
 TOLD_S = 3.0 * SCAN_S
 """A command takes a scan to be obeyed; the motors follow a little later."""
-LAB, FUSELAGE = ModbusScene(), ModbusScene("fuselage-modbus", shift_mm=12.0, speed_mm_s=5.0)
+LAB, FUSELAGE = ModbusScene(), ModbusScene("fuselage-modbus", shift_mm=8.0, speed_mm_s=5.0)
 
 
 # what happens on the wire ------------------------------------------------------------------------------------------
@@ -148,10 +149,11 @@ ROWS = {
     ),
     "MB-05 heartbeat not taken": Row(hang, DriveFault, "B.X", 0.12 + TOLD_S, Trigger.HEARTBEAT_LOST, slow=True),
     "MB-06 other unit": Row(other_unit, WrongIdentity, "positioner B", POLL_S + TOLD_S, Trigger.DRIVE_FAULT),
-    "AX-05 limit switch": Row(press_limit, DriveFault, "B.Z", TOLD_S, Trigger.LIMIT_SWITCH),
+    "AX-05 limit switch": Row(press_limit, MotionError, "B.Z", TOLD_S, Trigger.LIMIT_SWITCH),
 }
 """Positioner B is the victim. `slow`: its own watchdog stops it, along the ordinary ramp; it takes the others along.
-Frozen registers go on as if all were well, but for the number of the scan.
+Frozen registers go on as if all were well, but for the number of the scan. A switch may be read before its PLC has
+stopped for it: one trigger all the same.
 """
 
 
@@ -404,7 +406,7 @@ class Jam:
     phase: float | None = None
 
     def scene(self) -> ModbusScene:
-        shift_mm = 6.0 if self.speed_mm_s <= 1.0 else 8.0 if self.cell == "lab-modbus" else 16.0
+        shift_mm = 3.0 if self.speed_mm_s <= 1.0 else 8.0 if self.cell == "lab-modbus" else 16.0
         off = PLAY if self.tight else ()
         return ModbusScene(
             self.cell, seed=3, shift_mm=shift_mm, turn_deg=0.1, speed_mm_s=self.speed_mm_s, errors_off=off

@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 
 from docking.assemble.motion_side import local_motion
 from docking.assemble.simulated import make_far_end, truth_of
-from docking.config import CellFile
+from docking.config import CellFile, JobFile
 from docking.config.build import positioners_from
 from docking.config.load import load_cell, load_job
 from docking.errors import DockingError
@@ -19,6 +20,7 @@ from docking.motion import QueuedMotion
 from docking.types import Array, MoveResult, Plan
 from sim.plc.group import PlcGroup
 from sim.plc.modbus_tcp import ModbusTcpConnection
+from sim.truth import TruthFile
 from sim.virtual_time import run_virtual
 from tests.support.motion_record import Record, RecordedPlant
 from tests.support.planned_moves import CELLS, a_plan, lab_site
@@ -27,7 +29,7 @@ MOVES_MM = 2e-4
 """More than this between two scans is motion: 0.02 mm/s."""
 ROUNDED_MM = 0.003
 """Segments are rounded to micrometres, servo lags differ by 5 %."""
-QUIET_S = 1.0
+QUIET_S = 0.6
 WEIGHED_S = 0.15
 """So long after a fault all axes have come to rest over GROUP_OK."""
 COMMAND_AT, RUN, RESUME = 0, 7, 10
@@ -49,18 +51,32 @@ class ModbusScene:
     errors_off: tuple[str, ...] = ()
 
 
+@cache
+def _files(name: str) -> tuple[CellFile, JobFile, TruthFile]:
+    cell = load_cell(CELLS / f"{name}.toml")
+    return cell, load_job(CELLS / f"{name}.job.toml", cell), truth_of(CELLS / f"{name}.toml")
+
+
+@cache
+def _plan(scene: ModbusScene, standing_mm: tuple[float, ...]) -> Plan:
+    """The move of a scene: most cases of the suite make the same one."""
+    reach = {"reach_mm": scene.shift_mm, "turn_deg": scene.turn_deg, "speed_mm_s": scene.speed_mm_s}
+    period_s = _files(scene.name)[0].bus.segment_s  # type: ignore[union-attr]
+    seed = int(np.random.default_rng(scene.seed).integers(1000))
+    start_mm = np.array(standing_mm)
+    return a_plan(replace(lab_site(scene.name), **reach), seed, period_s=period_s, queued=True, start_mm=start_mm)
+
+
 class ReadyModbus:
     """Make it on the loop that runs it. `tamper(frame)` may lose or change what one positioner hears and says."""
 
     def __init__(self, scene: ModbusScene) -> None:
         self.loop, self.scene = asyncio.get_running_loop(), scene
-        cell = load_cell(CELLS / f"{scene.name}.toml")
+        cell, job, truth = _files(scene.name)
         bus = cell.bus.model_copy(update=dict(scene.bus))
         limits = cell.limits.model_copy(update={"missing_cycles": 2})
         self.cell: CellFile = cell.model_copy(update={"bus": bus, "limits": limits, "inputs": None})
-        job = load_job(CELLS / f"{scene.name}.job.toml", cell)
         self.positioners = positioners_from(self.cell, job)
-        truth = truth_of(CELLS / f"{scene.name}.toml")
         truth = truth.model_copy(update={"errors": {**truth.errors, **dict.fromkeys(scene.errors_off, 0.0)}})
         self.plant = make_far_end(self.cell, job, truth, scene.seed).plant
         self.recorded = RecordedPlant(self.plant)
@@ -85,17 +101,7 @@ class ReadyModbus:
 
     async def ready(self) -> None:
         standing = await self.motion.enable()
-        scene, rng = self.scene, np.random.default_rng(self.scene.seed)
-        site = replace(
-            lab_site(scene.name), reach_mm=scene.shift_mm, turn_deg=scene.turn_deg, speed_mm_s=scene.speed_mm_s
-        )
-        self.plan = a_plan(
-            site,
-            int(rng.integers(1000)),
-            period_s=self.cell.bus.segment_s,
-            queued=True,
-            start_mm=standing,  # type: ignore[union-attr]
-        )
+        self.plan = _plan(self.scene, tuple(standing.tolist()))
         await self.motion.load(self.plan)
 
     async def move(self, share: float, fault: Callable[[ReadyModbus], Any], *, weigh: bool = False) -> None:
