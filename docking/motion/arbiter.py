@@ -64,6 +64,7 @@ class Arbiter:
 
     `allowed_s(reaction)` is asked when a reaction begins: how long until standstill (PPS, FAST_PPS, SQS) or until the
     brakes hold (SBT); after that the next reaction begins. The motion side tells `mode` what it does by `enter`.
+    `unreferenced` axes have lost their reference; of these, those `restarted` have no torque and say nothing.
     """
 
     def __init__(self, allowed_s: Callable[[Reaction], float]) -> None:
@@ -72,6 +73,7 @@ class Arbiter:
         self.first: Finding | None = None
         self.later: tuple[Finding, ...] = ()
         self.unreferenced: tuple[str, ...] = ()
+        self.restarted: tuple[str, ...] = ()
         self.rejected = 0
         self.on_latched: Callable[[], None] = lambda: None
         self._allowed_s = allowed_s
@@ -110,6 +112,8 @@ class Arbiter:
         where = finding.error.where
         if finding.trigger in UNREFERENCING and where not in self.unreferenced:
             self.unreferenced = (*self.unreferenced, where)
+        if finding.trigger is Trigger.NODE_RESTARTED and where not in self.restarted:
+            self.restarted = (*self.restarted, where)
         if finding.trigger not in REQUESTS:
             self._raised = self._raised or finding.trigger not in LASTING
             self._note(finding)
@@ -137,7 +141,16 @@ class Arbiter:
         reason = self.objection(role) or self._not_yet(held)
         if reason:
             raise EventRefused("reset", reason, value=f"reset by {role.value}")
-        self.reaction, self.first, self.later, self.unreferenced = Reaction.NONE, None, (), ()
+        self.reaction, self.first, self.later = Reaction.NONE, None, ()
+        self.unreferenced = self.restarted = ()
+
+    def admit(self, name: str) -> Role:
+        """The role that asks for a reset, before anything is done for it. Raises BadArgument, EventRefused."""
+        role = Role.named(name)
+        objection = self.objection(role)
+        if objection:
+            raise EventRefused("reset", objection, value=f"reset by {name}")
+        return role
 
     def objection(self, role: Role) -> str:
         """Why this role cannot reset what is kept, whatever becomes of the cause; empty where it can."""

@@ -7,27 +7,27 @@ their ordinary ramp, everything harder their quick one, which ends with brakes a
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 
 from docking.errors import (
-    BadArgument,
     BadReply,
     Defect,
     DeviceSilent,
     DockingError,
-    EventRefused,
     LinkLost,
     OutcomeUnknown,
     PlanStale,
     StoppedByOperator,
 )
-from docking.motion.arbiter import Arbiter, Mode, Reaction, Role
+from docking.motion.arbiter import Arbiter, Mode, Reaction
 from docking.motion.monitors import Watch
 from docking.motion.playback import Playback
 from docking.motion.recorder import Recorder
+from docking.motion.start import require, require_here, share_of
+from docking.motion.stop_clock import StopClock
 from docking.motion.triggers import Finding, Trigger
 from docking.ports import QueuedPositioners
 from docking.types import Array, AxisState, Feedback, Identity, MoveResult, Plan, readonly
@@ -61,6 +61,7 @@ class _Move:
     playback: Playback
     recorder: Recorder
     done: asyncio.Future[MoveResult]
+    clock: StopClock
     held: bool = False
     phase: _Phase = _Phase.LOADED
 
@@ -95,7 +96,8 @@ class QueuedMotion:
         return await self._bus.bring_up()
 
     async def enable(self) -> Array:
-        """Raises the fault that is kept: `reset` comes first."""
+        """Raises AxisUnreferenced, or the fault that is kept: `reset` comes first."""
+        self.arbiter.require_referenced()
         self._refuse()
         await self._end_keeper()
         self.arbiter.enter(Mode.OFF)
@@ -110,11 +112,12 @@ class QueuedMotion:
         return self._commanded
 
     async def load(self, plan: Plan) -> None:
-        """Take a plan; the controllers take its start and its quick ramp. Nothing moves."""
+        """Take a plan; the controllers take its start and its quick ramp. Nothing moves.
+
+        Refused where the load cells show a part that is strained already; a relief is the plan for that.
+        """
         self._refuse()
-        gap = float(np.max(np.abs(plan.q_mm[0] - self._commanded)[self._watch.driven]))
-        if not (gap <= START_TOLERANCE_MM):
-            raise PlanStale(plan.stage, f"it starts {gap:.4f} mm from where the axes are commanded")
+        require_here(plan, self._commanded, self._watch.driven, START_TOLERANCE_MM)
         self._loaded = None
         self._require_enabled()
         await self._bus.load(plan)
@@ -122,6 +125,7 @@ class QueuedMotion:
         self._refuse()
         self._require_enabled()
         self._watch.watch_about(plan.q_mm[0], relief=plan.kind == "relief")
+        require(self._watch.strained_before(self.feedback()))
         self._commanded = plan.q_mm[0]
         self._loaded = Playback(plan)
 
@@ -131,9 +135,10 @@ class QueuedMotion:
         if playback is None or playback.plan.plan_hash != plan_hash:
             raise PlanStale("motion", "this plan is not loaded")
         self._require_enabled()
+        require(self._watch.changed_at_rest(self.feedback()))
         recorder = Recorder(self._watch, max(1, round(TRACE_PERIOD_S / self._poll_s)))
         self.arbiter.enter(Mode.MOVING)
-        self._move = move = _Move(playback, recorder, asyncio.get_running_loop().create_future())
+        self._move = move = _Move(playback, recorder, asyncio.get_running_loop().create_future(), StopClock())
         self._slowing, self._still, self._unasked = False, 0, 0
         early, self._early = self._early, []
         for verb in early:
@@ -155,8 +160,13 @@ class QueuedMotion:
         self._wake()
 
     def _obey(self, move: _Move, verb: str) -> None:
+        changed = None
+        if verb == "resume" and self._feedback is not None:
+            changed = self._watch.changed_at_rest(self._feedback)
         if verb == "stop":
             self._raise(Trigger.OPERATOR_STOP, StoppedByOperator("motion"))
+        elif changed is not None:
+            self._raise(changed.trigger, changed.error)
         else:
             move.held = verb == "hold"
 
@@ -165,9 +175,7 @@ class QueuedMotion:
 
         The controllers take a new rate at standstill only: a move in progress is held for it. Raises BadArgument.
         """
-        if not (0.0 <= percent <= 100.0):
-            raise BadArgument("speed override", value=percent, limit="0 to 100 %")
-        self._share = percent / 100.0
+        self._share = share_of(percent)
         self._wake()
 
     def report(self, finding: Finding) -> None:
@@ -180,10 +188,7 @@ class QueuedMotion:
 
         Controllers in fault are reset, too. Raises EventRefused with the reason, and what their commands raise.
         """
-        asked = Role(role)
-        objection = self.arbiter.objection(asked)
-        if objection:
-            raise EventRefused("reset", objection, value=f"reset by {role}")
+        asked = self.arbiter.admit(role)
         await self._bus.command("reset")
         self._deaf = False
         await asyncio.sleep(RESET_S)
@@ -288,6 +293,7 @@ class QueuedMotion:
         await self._react()
         now_s = asyncio.get_running_loop().time()
         self.arbiter.poll(now_s, self.arbiter.mode is Mode.STOPPING and self._at_rest())
+        self._note_finding(now_s)
         await self._react()
         move = self._move
         if self.arbiter.mode in (Mode.STANDING, Mode.OFF):
@@ -346,6 +352,8 @@ class QueuedMotion:
         except DockingError as error:
             self._deaf = True
             self._raise(_trigger_of(error), error)
+        if self._slowing:
+            self._note_command()
 
     # monitors and reactions --------------------------------------------------------------------------------------
     def _judge(self, feedback: Feedback) -> None:
@@ -376,7 +384,18 @@ class QueuedMotion:
         return self._move is not None and self._unasked <= 1
 
     def _raise(self, trigger: Trigger, error: DockingError) -> None:
-        self.arbiter.raise_(Finding(trigger, error), asyncio.get_running_loop().time())
+        now_s = asyncio.get_running_loop().time()
+        self.arbiter.raise_(Finding(trigger, error), now_s)
+        self._note_finding(now_s)
+
+    def _note_finding(self, now_s: float) -> None:
+        if self._move is not None:
+            self._move.clock.follow(self.arbiter.latched, self.arbiter.reaction, now_s)
+
+    def _note_command(self) -> None:
+        """All controllers that can be reached have the command by now."""
+        if self._move is not None:
+            self._move.clock.commanded(asyncio.get_running_loop().time())
 
     def _allowed_s(self, reaction: Reaction) -> float:
         """How long a reaction that begins now may take."""
@@ -389,6 +408,7 @@ class QueuedMotion:
             begun, self._applied = self._applied, self.arbiter.reaction
             if self._applied is Reaction.HW:
                 self._bus.go_silent()
+                self._note_command()
                 self._finish("fault")
             elif self._applied >= Reaction.FAST_PPS > begun:
                 await self._tell("quick-stop")
@@ -402,6 +422,7 @@ class QueuedMotion:
             # The controllers have braked and taken the torque, or will: a fault of their own ends with that.
             self.arbiter.enter(Mode.OFF)
         if move is not None and feedback is not None:
+            move.clock.rested(asyncio.get_running_loop().time())
             self._finish("fault" if self.arbiter.latched else "done" if move.ended(feedback) else "stopped")
         if not self.arbiter.latched:
             self._applied = self.arbiter.reaction
@@ -417,7 +438,8 @@ class QueuedMotion:
         if self.arbiter.mode is Mode.MOVING:
             self.arbiter.enter(Mode.STANDING)
         if not move.done.done():
-            move.done.set_result(move.recorder.result(outcome, path_time_s, self._commanded, cause))
+            recorded = move.recorder.result(outcome, path_time_s, self._commanded, cause)
+            move.done.set_result(replace(recorded, stop=move.clock.times()))
 
 
 def _trigger_of(error: DockingError) -> Trigger:

@@ -181,7 +181,6 @@ HARDER: dict[Trigger, str] = {
 """Triggers that a path-preserving stop would answer, were they not what they may be."""
 
 _TABLE = """
-
 ## Triggers
 
 Modes: *off* without power, *standing* enabled and at rest, *moving* while a plan is played, *stopping* while a reaction

@@ -24,9 +24,9 @@ class Standstill:
         """Count from here on."""
         self._still = 0
 
-    def seen(self, before: Feedback | None, now: Feedback) -> bool:
-        """Judge one cycle; true when all axes stand."""
+    def seen(self, before: Feedback | None, now: Feedback, gone: tuple[int, ...] = ()) -> bool:
+        """Judge one cycle; true when all axes stand. Those `gone` (indices) have no torque and no voice any more."""
         moved = np.inf if before is None else np.abs(now.position_mm - before.position_mm).max()
-        resting = moved <= REST_MM and now.age_cycles.max() <= REST_AGE
+        resting = moved <= REST_MM and np.delete(now.age_cycles, gone).max() <= REST_AGE
         self._still = self._still + 1 if resting else 0
         return self._still >= REST_CYCLES

@@ -9,30 +9,20 @@ from __future__ import annotations
 import asyncio
 import math
 from collections import deque
-from dataclasses import dataclass, replace
 
 import numpy as np
 
-from docking.errors import (
-    BadArgument,
-    Defect,
-    DockingError,
-    EnableFailed,
-    EventRefused,
-    LinkError,
-    LinkLost,
-    PlanStale,
-    StoppedByOperator,
-    TickLate,
-)
-from docking.motion.arbiter import Arbiter, Mode, Reaction, Role
+from docking.errors import Defect, DockingError, LinkLost, PlanStale, StoppedByOperator, TickLate
+from docking.motion.arbiter import Arbiter, Mode, Reaction
+from docking.motion.braking import Braking
 from docking.motion.lateness import Lateness
 from docking.motion.monitors import Watch
 from docking.motion.playback import Playback
 from docking.motion.recorder import Recorder
 from docking.motion.standstill import Standstill
-from docking.motion.stop_clock import StopClock
+from docking.motion.start import require, require_here, share_of
 from docking.motion.stops import PlannedStop, planned_stop
+from docking.motion.streamed_move import StreamedMove
 from docking.motion.triggers import Finding, Trigger
 from docking.ports import StreamedPositioners
 from docking.types import Array, Feedback, Identity, MoveResult, Plan, readonly
@@ -44,23 +34,8 @@ STOP_CYCLES = 2
 QUICK_STOP_S = 0.1
 """By which a quick stop may outlast its ramp until all axes are seen at rest."""
 BRAKE_S = 2.0
-SEEN_S = 0.1
-"""So long after its last set-point a stop on the path is told even if the axes are not seen at rest."""
 RESET_S = 0.3
 """How long nothing may be found again after what the nodes reported has been forgotten: three heartbeats."""
-
-
-@dataclass
-class _Move:
-    """A running move. `told_s`: when its last set-point was sent after a stop."""
-
-    playback: Playback
-    recorder: Recorder
-    stop: PlannedStop
-    done: asyncio.Future[MoveResult]
-    over: asyncio.Event
-    clock: StopClock
-    told_s: float | None = None
 
 
 class StreamedMotion:
@@ -81,13 +56,12 @@ class StreamedMotion:
         self._history: deque[Array] = deque(maxlen=2)
         self._feedback: Feedback | None = None
         self._loaded: tuple[Playback, PlannedStop] | None = None
-        self._move: _Move | None = None
+        self._move: StreamedMove | None = None
         self._early: list[str] = []
         self._share = 1.0
         self._applied = Reaction.NONE
-        self._braking: asyncio.Task[None] | None = None
-        self._braked = False
-        self._brake_due_s = 0.0
+        # Brakes that stay unconfirmed let the arbiter open the hardware chain when their time is over.
+        self._braking = Braking(positioners, lambda error: self._raise(Trigger.AXIS_OFF, error))
         self._standstill = Standstill()
         self._quick_stop_s = QUICK_STOP_S
         self._timer: asyncio.Handle | None = None
@@ -123,9 +97,7 @@ class StreamedMotion:
         a relief is the plan for that.
         """
         self._refuse()
-        gap = float(np.max(np.abs(plan.q_mm[0] - self._setpoint)[self._watch.driven]))
-        if not (gap <= START_TOLERANCE_MM):
-            raise PlanStale(plan.stage, f"it starts {gap:.4f} mm from where the axes are commanded")
+        require_here(plan, self._setpoint, self._watch.driven, START_TOLERANCE_MM)
         self._require_enabled()
         stop = planned_stop(plan, self._bus.a_quick_mm_s2, self._cycle_s)
         self._loaded = None
@@ -136,7 +108,7 @@ class StreamedMotion:
         self._history.extend([self._setpoint] * 2)
         await self._next_tick()
         self._watch.watch_about(plan.q_mm[0], relief=plan.kind == "relief")
-        self._require(self._watch.strained_before(self.feedback()))
+        require(self._watch.strained_before(self.feedback()))
         self._quick_stop_s = stop.longest_s + QUICK_STOP_S
         self._loaded = Playback(plan, self._share), stop
 
@@ -146,12 +118,12 @@ class StreamedMotion:
         if loaded is None or loaded[0].plan.plan_hash != plan_hash:
             raise PlanStale("motion", "this plan is not loaded")
         self._require_enabled()
-        self._require(self._watch.changed_at_rest(self.feedback()))
+        require(self._watch.changed_at_rest(self.feedback()))
         playback, stop = loaded
         recorder = Recorder(self._watch, max(1, round(TRACE_PERIOD_S / self._cycle_s)))
         done: asyncio.Future[MoveResult] = asyncio.get_running_loop().create_future()
         self.arbiter.enter(Mode.MOVING)
-        self._move = _Move(playback, recorder, stop, done, asyncio.Event(), StopClock())
+        self._move = StreamedMove(playback, recorder, stop, done)
         if self._early:
             playback.wait()
         for verb in self._early:
@@ -178,9 +150,7 @@ class StreamedMotion:
 
         Raises BadArgument.
         """
-        if not (0.0 <= percent <= 100.0):
-            raise BadArgument("speed override", value=percent, limit="0 to 100 %")
-        self._share = percent / 100.0
+        self._share = share_of(percent)
         move = self._move
         if move is not None and self.arbiter.mode is Mode.MOVING:
             move.playback.override(self._share)
@@ -194,10 +164,7 @@ class StreamedMotion:
 
         Drives in fault are reset, too. Raises EventRefused with the reason, EnableFailed, LinkError.
         """
-        asked = Role.named(role)
-        objection = self.arbiter.objection(asked)
-        if objection:
-            raise EventRefused("reset", objection, value=f"reset by {role}")
+        asked = self.arbiter.admit(role)
         await self._bus.reset_faults()
         await asyncio.sleep(RESET_S)
         self.arbiter.reset(asked, self._clock_s())
@@ -218,9 +185,7 @@ class StreamedMotion:
             self.request("stop")
             await over.wait()
         self._end_ticks()
-        if self._braking is not None:
-            self._braking.cancel()
-            await asyncio.gather(self._braking, return_exceptions=True)
+        await self._braking.cancel()
         await self._bus.close()
 
     def _refuse(self) -> None:
@@ -237,13 +202,7 @@ class StreamedMotion:
         if self.arbiter.mode is not Mode.STANDING:
             raise PlanStale("motion", "the axes have to be enabled again")
 
-    @staticmethod
-    def _require(objection: Finding | None) -> None:
-        """Raise what forbids a start; nothing is kept, as the next start is judged anew."""
-        if objection is not None:
-            raise objection.error
-
-    def _obey(self, move: _Move, verb: str) -> None:
+    def _obey(self, move: StreamedMove, verb: str) -> None:
         if verb == "stop":
             self._raise(Trigger.OPERATOR_STOP, StoppedByOperator("motion"))
         elif self.arbiter.mode is not Mode.MOVING:
@@ -299,8 +258,8 @@ class StreamedMotion:
         if not (late_s <= self._late_limit_s):
             self._raise(Trigger.TICK_LATE, TickLate("motion", value=late_s, limit=self._late_limit_s))
         stopping = self.arbiter.mode is Mode.STOPPING
-        if self._applied is Reaction.SBT and self._braking is None:
-            self._brake_at_rest(before, feedback)
+        if self._applied is Reaction.SBT and self._braking.waits:
+            self._braking.cycle(self._stand(before, feedback))
         self._react(self.arbiter.poll(self._clock_s(), stopping and self._at_rest(before, feedback)))
         if self._applied is not Reaction.HW:
             self._go_on(before, feedback, quick=self._applied >= Reaction.SQS > applied)
@@ -340,20 +299,13 @@ class StreamedMotion:
         if self._move is not None:
             self._move.clock.commanded(asyncio.get_running_loop().time())
 
-    def _end_stop(self, move: _Move, before: Feedback | None, feedback: Feedback) -> None:
+    def _end_stop(self, move: StreamedMove, before: Feedback | None, feedback: Feedback) -> None:
         """The commands are at rest after a stop: end the move as soon as the axes are seen at rest, too."""
-        now_s = asyncio.get_running_loop().time()
-        move.told_s = now_s if move.told_s is None else move.told_s
-        if self._standstill.seen(before, feedback):
-            move.clock.rested(now_s)
-        elif now_s - move.told_s <= SEEN_S:
+        if not move.has_ended(self._stand(before, feedback), asyncio.get_running_loop().time()):
             return
         if self._applied >= Reaction.SQS:
             self._setpoint = readonly(feedback.position_mm)
-        if self.arbiter.latched:
-            self._finish("fault")
-        else:
-            self._finish("done" if move.playback.at_end else "stopped")
+        self._finish("fault" if self.arbiter.latched else "done" if move.playback.at_end else "stopped")
         self._applied = self.arbiter.reaction
 
     # monitors and reactions --------------------------------------------------------------------------------------
@@ -390,60 +342,40 @@ class StreamedMotion:
             return self._quick_stop_s + BRAKE_S
         if reaction >= Reaction.SQS or self._move is None:
             return self._quick_stop_s
-        playback = self._move.playback
-        led_s = playback.turn_s(0.0) if reaction is Reaction.PPS else playback.rate / self._move.stop.fast_slew_per_s
-        return led_s + STOP_CYCLES * self._cycle_s
+        return self._move.led_stop_s(reaction) + STOP_CYCLES * self._cycle_s
 
     def _react(self, reaction: Reaction) -> None:
         """Begin the reaction in force, unless it has begun."""
-        if self._move is not None:
-            now_s = asyncio.get_running_loop().time()
-            self._move.clock.follow(self.arbiter.latched, reaction, now_s)
+        now_s = asyncio.get_running_loop().time()
+        move = self._move
+        if move is not None:
+            move.clock.follow(self.arbiter.latched, reaction, now_s)
         if not (reaction > self._applied):
             return
         self._applied = reaction
         self._standstill.begin()
-        if reaction is Reaction.HW:
+        if move is not None and reaction < Reaction.SQS:
+            move.slow_down(reaction)
+        elif reaction is Reaction.HW:
             self._bus.go_silent()
             self._note_command()
         elif reaction >= Reaction.SQS:
             self._bus.quick_stop()
             self._note_command()
-            if reaction is Reaction.SBT:
-                self._begin_braking()
-        elif self._move is not None and reaction is Reaction.FAST_PPS:
-            self._move.playback.stop_straight(self._move.stop.fast_slew_per_s)
-        elif self._move is not None and reaction is Reaction.PPS:
-            self._move.playback.hold()
+        if reaction is Reaction.SBT:
+            self._braking.begin(now_s + self._quick_stop_s, standing=move is None or move.playback.standing)
 
-    def _begin_braking(self) -> None:
-        """Brakes close on axes at rest: at once where none is led any more, else when all have come to rest."""
-        self._braked, self._braking = False, None
-        move, loop = self._move, asyncio.get_running_loop()
-        self._brake_due_s = loop.time() + self._quick_stop_s
-        if move is None or move.playback.standing:
-            self._braking = loop.create_task(self._brake())
-
-    def _brake_at_rest(self, before: Feedback | None, feedback: Feedback) -> None:
-        now_s = asyncio.get_running_loop().time()
-        # An axis that does not come to rest by itself is what a brake is for.
-        if self._standstill.seen(before, feedback) or now_s >= self._brake_due_s:
-            self._braking = asyncio.get_running_loop().create_task(self._brake())
-
-    async def _brake(self) -> None:
-        try:
-            await self._bus.brake()
-            self._braked = True
-        except (EnableFailed, LinkError) as error:
-            # It stays unconfirmed, so that the arbiter opens the hardware chain when its time is over.
-            self._raise(Trigger.AXIS_OFF, error)
+    def _stand(self, before: Feedback | None, feedback: Feedback) -> bool:
+        """One cycle on: whether all axes are seen at rest."""
+        gone = tuple(self.axes.index(axis) for axis in self.arbiter.restarted)
+        return self._standstill.seen(before, feedback, gone)
 
     def _at_rest(self, before: Feedback | None, feedback: Feedback) -> bool:
         """Whether the reaction in force has reached its end."""
         if self._applied is Reaction.SBT:
-            return self._braked
+            return self._braking.confirmed
         if self._applied is Reaction.SQS:
-            return self._standstill.seen(before, feedback)
+            return self._stand(before, feedback)
         return self._move is None or self._move.playback.standing or self._move.playback.at_end
 
     def _finish(self, outcome: str) -> None:
@@ -452,8 +384,7 @@ class StreamedMotion:
         if move is None:
             return
         cause = self.arbiter.first.error if self.arbiter.first is not None else None
-        recorded = move.recorder.result(outcome, move.playback.path_time_s, self._setpoint, cause)
-        result = replace(recorded, stop=move.clock.times())
+        result = move.result(outcome, self._setpoint, cause)
         self._end()
         if not move.done.done():
             move.done.set_result(result)

@@ -177,6 +177,44 @@ def test_what_a_fault_is_about(happening: Callable[[object], None], kind: FaultK
     run(scenario)
 
 
+@pytest.mark.parametrize(
+    ("graver", "kind"),
+    [
+        (lambda drives: drives.restart("C.Z"), FaultKind.NODE_RESTARTED),
+        (lambda drives: drives.mute("C.Z"), FaultKind.HEARTBEAT_LOST),
+        (lambda drives: drives.faults.forge_set_point("C.Z", 0.0), FaultKind.FOREIGN_SENDER),
+    ],
+)
+def test_a_complaint_hides_nothing_graver_and_nothing_graver_is_hidden(
+    graver: Callable[[object], None], kind: FaultKind
+) -> None:
+    async def scenario(bench: Bench) -> None:
+        q = await bench.ready()
+        await tick(bench, q, 5)
+        bench.drives.emergency(0, 0x4210)
+        await tick(bench, q, 5)
+        graver(bench.drives)
+        await tick(bench, q, 40)
+        bench.drives.emergency(1, 0x8700)
+        await tick(bench, q, 2)
+        feedback = bench.master.latest()
+        assert feedback.fault is not None
+        assert (feedback.fault[0], feedback.fault_kind) == ("C.Z", kind)
+
+    run(scenario)
+
+
+def test_a_lost_sync_has_a_name() -> None:
+    async def scenario(bench: Bench) -> None:
+        q = await bench.ready()
+        await tick(bench, q, 5)
+        bench.drives.emergency(3, 0x8700)
+        await tick(bench, q, 2)
+        assert bench.master.latest().fault == ("B.X", 0x8700, "SYNC lost")
+
+    run(scenario)
+
+
 def test_a_drive_in_fault_comes_before_one_that_only_complains() -> None:
     async def scenario(bench: Bench) -> None:
         q = await bench.ready()

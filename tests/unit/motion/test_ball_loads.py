@@ -249,3 +249,94 @@ def test_positioners_without_a_cell_are_left_out():
     bench = Bench(limits, none, np.full(12, np.nan))
     assert bench.twice(np.full(12, np.nan)) is None
     assert np.isnan(bench.watch.measured_force_n)
+
+
+# at rest -----------------------------------------------------------------------------------------------------------
+def strained(limits, force, *, relief=False):
+    """What is said before a move about a part that shows `force` at rest."""
+    bench = Bench(limits, force=force, relief=relief)
+    told = read_back(Q, t_s=bench.t_s, force_n=force)
+    return bench.watch.strained_before(told)
+
+
+def twisted(force_n):
+    """Load cells of a part whose vertical axes press against each other with `force_n` each."""
+    force = resting()
+    force[2::3] += force_n * WARP
+    return force
+
+
+@pytest.mark.parametrize(
+    ("limits", "trigger", "kind"),
+    [
+        ({"measured_whole_force_n": 1000.0}, Trigger.MEASURED_FORCE, MeasuredForceTrip),
+        ({"measured_whole_warp_n": 1000.0}, Trigger.MEASURED_WARP, MeasuredWarpTrip),
+    ],
+)
+def test_a_strained_part_is_not_moved_but_by_a_relief(limits, trigger, kind):
+    limits = replace(WIDE, overload=9.0, underload=0.01, **limits)
+    at_limit = 1000.0 if trigger is Trigger.MEASURED_FORCE else 1000.0 / strained_warp_of_one(limits)
+    assert strained(limits, twisted(0.99 * at_limit)) is None
+    found = strained(limits, twisted(1.01 * at_limit))
+    assert found is not None
+    assert found.trigger is trigger
+    assert isinstance(found.error, kind)
+    assert found.error.limit == 1000.0
+    assert found.error.value == pytest.approx(1010.0)
+    assert "docking relieve" in found.error.text()
+    assert strained(limits, twisted(1.01 * at_limit), relief=True) is None
+
+
+def strained_warp_of_one(limits):
+    """Warp that one newton at every vertical axis, with its sign, makes."""
+    bench = Bench(replace(limits, measured_whole_warp_n=9e9), force=twisted(1.0))
+    bench.sample(twisted(1.0), moving=False)
+    return bench.watch._loads.whole_warp_n
+
+
+def test_a_ball_that_carries_too_much_is_not_moved_either():
+    limits = replace(WIDE, overload=1.1, underload=0.5)
+    share = z_loads_n(600.0, 200.0)
+    assert strained(limits, plus(2, 0.09 * share[0])) is None
+    found = strained(limits, plus(2, 0.11 * share[0]))
+    assert found is not None
+    assert (found.trigger, found.error.where) == (Trigger.OVERLOAD, "A")
+    assert "docking relieve" in found.error.text()
+    assert strained(limits, plus(2, 0.11 * share[0]), relief=True) is None
+
+
+def test_a_force_that_changes_between_load_and_start_is_told():
+    bench = Bench(replace(WIDE, standing_force_n=200.0))
+
+    def changed(force):
+        return bench.watch.changed_at_rest(read_back(Q, t_s=bench.t_s, force_n=force))
+
+    assert changed(resting()) is None
+    assert changed(plus(3, 199.0)) is None
+    for force in (plus(3, 201.0), plus(3, -201.0), twisted(201.0)):
+        found = changed(force)
+        assert found is not None
+        assert isinstance(found.error, MeasuredForceTrip)
+        assert (found.error.limit, "measure again" in found.error.text()) == (200.0, True)
+    assert changed(plus(3, np.nan)) is not None
+    # Once the part moves there is nothing to compare with: the limits of the move count.
+    bench.sample(resting(), q=Q, after_s=0.01)
+    assert changed(plus(3, 201.0)) is None
+
+
+@pytest.mark.parametrize(("change_n", "trips"), [(199.0, False), (201.0, True), (-201.0, True)])
+def test_a_force_that_changes_in_a_hold_is_told_by_its_second_sample(change_n, trips):
+    """What the move itself has brought since it was loaded is no change."""
+    bench = Bench(replace(WIDE, standing_force_n=200.0))
+    begun = plus(4, 900.0)
+    for k in range(5):
+        assert bench.sample(begun, q=np.full(12, 0.1 * k)) is None
+    held = np.full(12, 0.4)
+    for _ in range(5):
+        assert bench.sample(begun, q=held) is None
+    assert bench.sample(plus(4, 900.0 + change_n), q=held) is None
+    found = bench.sample(plus(4, 900.0 + change_n), q=held)
+    assert (found is not None) == trips
+    if found is not None:
+        assert found.trigger is Trigger.MEASURED_FORCE
+        assert found.error.value == pytest.approx(abs(change_n))

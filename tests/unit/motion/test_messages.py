@@ -12,7 +12,7 @@ import pytest
 from docking import errors
 from docking.errors import BadReply, Defect, DockingError, FollowingErrorTrip, LeaseLost
 from docking.motion.messages import VERSION, decode, encode
-from docking.types import AxisState, Feedback, Identity, MoveResult, Trace
+from docking.types import AxisState, Feedback, Identity, MoveResult, StopTimes, Trace
 from tests.support.planned_moves import a_plan, lab_site
 
 
@@ -59,7 +59,9 @@ def test_a_move_that_ended_in_a_fault_brings_its_cause():
     tables = ("position_mm", "following_error_mm", "force_n")
     trace = Trace(**{f.name: np.zeros((0, 3) if f.name in tables else 0) for f in fields(Trace)})
     cause = FollowingErrorTrip("A.X", "why", value=0.5, limit=0.1)
-    came = there_and_back(MoveResult("fault", 1.0, np.zeros(3), trace, np.zeros(3), 0.1, 2.0, cause))
+    stop = StopTimes(12.5, 12.51, math.inf)
+    came = there_and_back(MoveResult("fault", 1.0, np.zeros(3), trace, np.zeros(3), 0.1, 2.0, cause, stop))
+    assert came.stop == stop
     assert came.trace.position_mm.shape == (0, 3)
     assert isinstance(came.cause, FollowingErrorTrip)
     assert came.cause.text("zh") == cause.text("zh")

@@ -8,7 +8,16 @@ from collections.abc import Awaitable, Callable
 import numpy as np
 import pytest
 
-from docking.errors import DriveFault, LeaseLost, MotionProcessLost, PlanStale, TickLate
+from docking.errors import (
+    BadArgument,
+    DriveFault,
+    EventRefused,
+    FollowingErrorTrip,
+    LeaseLost,
+    MotionProcessLost,
+    PlanStale,
+    TickLate,
+)
 from docking.motion import StreamedMotion
 from docking.motion.channel import QueueChannel
 from docking.motion.lateness import Lateness, measure_lateness, speed_limit_mm_s
@@ -262,3 +271,35 @@ def test_measuring_lateness_in_virtual_time_finds_none():
     found = run_virtual(lambda: measure_lateness(0.002, 1.0))
     assert found.samples == pytest.approx(500, abs=2)
     assert found.worst_s <= 1e-9
+
+
+def test_a_fault_is_reset_through_the_channel_by_role_and_edge_and_nothing_is_resumed():
+    async def scenario(bench: Bench) -> None:
+        move = await bench.moving()
+        await asyncio.sleep(0.4)
+        bench.bus.changes["following_error_mm"] = 9.0 * (np.arange(12) == 3)
+        result = await move
+        assert isinstance(result.cause, FollowingErrorTrip)
+        assert result.stop is not None
+        assert result.stop.found_s <= result.stop.commanded_s < result.stop.rest_s
+        for role, kind in (("operator", EventRefused), ("cleaner", BadArgument)):
+            with pytest.raises(kind):
+                await bench.motion.reset(role)
+        bench.bus.changes.clear()
+        await asyncio.sleep(1.0)
+        with pytest.raises(FollowingErrorTrip):
+            await bench.motion.enable()
+        await bench.motion.reset("supervisor")
+        sent = np.array(bench.bus.sent[-1])
+        bench.motion.request("resume")
+        await asyncio.sleep(1.0)
+        np.testing.assert_array_equal(bench.bus.sent[-1], sent)
+        with pytest.raises(PlanStale):
+            await bench.motion.start(PLAN.plan_hash)
+        with pytest.raises(EventRefused, match="nothing to reset"):
+            await bench.motion.reset("supervisor")
+        await bench.motion.enable()
+        assert bench.motion.feedback() is not None
+        await bench.motion.close()
+
+    play(scenario)

@@ -10,15 +10,29 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from docking.errors import AxisDrift, AxisNotEnabled, BadArgument, DriveFault, LinkLost, StopOverdue
+from docking.errors import (
+    AxisDrift,
+    AxisNotEnabled,
+    AxisUnreferenced,
+    BadArgument,
+    DriveFault,
+    EncoderJump,
+    EventRefused,
+    LinkLost,
+    MeasuredForceTrip,
+    PlanStale,
+    StopOverdue,
+)
+from docking.kinematics import axis_forces_n, ball_reactions_n, pose_from_axes
 from docking.motion import StreamedMotion
 from docking.motion.arbiter import Mode, Reaction
+from docking.motion.monitors import Watch
 from docking.motion.playback import Playback
 from docking.motion.stops import planned_stop
-from docking.motion.triggers import Trigger
-from docking.types import AxisState
+from docking.motion.triggers import Finding, Trigger
+from docking.types import AxisState, FaultKind
 from sim.virtual_time import run_virtual
-from tests.support.motion_fakes import LATE_CYCLES, StreamedFake, watch_of
+from tests.support.motion_fakes import LATE_CYCLES, LIMITS, LOAD, StreamedFake, watch_of
 from tests.support.planned_moves import a_plan, lab_site
 from tests.support.rigid_figure import path_gap_mm, rigid_gap_mm, sockets_mm
 
@@ -334,3 +348,223 @@ def test_a_plan_that_stands_still_is_armed_with_something():
     stop = planned_stop(still, POSITIONERS.a_quick_mm_s2, CYCLE_S)
     assert stop.t_stop_s == CYCLE_S
     np.testing.assert_array_equal(stop.peak_mm_s, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "sent_after_s"),
+    [
+        ({"following_error_mm": 2.0 * (np.arange(12) == 4)}, 0.0),
+        ({"states": OFF}, 0.0),
+        ({"fault": ("B.X", 0x4210, "hot"), "fault_kind": FaultKind.DRIVE_WARNING}, 0.0),
+    ],
+)
+def test_a_fault_tells_when_it_was_found_when_commands_changed_and_when_all_stood(change, sent_after_s):
+    async def scenario(bench):
+        move = await bench.begin()
+        await asyncio.sleep(0.5 * PLAN.duration_s + 0.005)
+        begun_s = bench.loop.time()
+        # A warning is one once a newer read-back has come.
+        for _ in range(2):
+            bench.bus.changes = {**change, "t_s": bench.loop.time()}
+            await asyncio.sleep(CYCLE_S)
+        while not move.done():
+            bench.bus.changes["t_s"] = bench.loop.time()
+            await asyncio.sleep(0.1 * CYCLE_S)
+        stop = (await move).stop
+        assert 0.0 < stop.found_s - begun_s <= 2.5 * CYCLE_S
+        assert stop.commanded_s - stop.found_s == pytest.approx(sent_after_s, abs=1e-9), "the same tick"
+        sent, at_s = np.array(bench.bus.sent), np.array(bench.bus.sent_at_s)
+        last_s = at_s[1:][np.abs(np.diff(sent, axis=0)).max(axis=1) > 1e-5].max()
+        # The axes are two cycles behind the set-points, and stand when three read-backs in a row say so.
+        assert 2.0 * CYCLE_S <= stop.rest_s - max(last_s, stop.commanded_s) <= 7.0 * CYCLE_S
+        assert bench.loop.time() - stop.rest_s <= CYCLE_S
+
+    on_bench(scenario)
+
+
+def test_a_stop_that_was_asked_for_has_its_times_and_a_plan_that_ran_to_its_end_has_none():
+    async def scenario(bench):
+        move = await bench.begin()
+        await asyncio.sleep(1.003)
+        asked_s = bench.loop.time()
+        bench.motion.request("stop")
+        result = await move
+        assert (result.result, result.cause) == ("stopped", None)
+        assert result.stop.found_s == asked_s
+        assert 0.0 < result.stop.commanded_s - asked_s <= CYCLE_S
+        assert result.stop.rest_s > asked_s + 1.5 / PLAN.rate_slew_per_s
+
+    async def whole(bench):
+        assert (await (await bench.begin())).stop is None
+
+    on_bench(scenario)
+    on_bench(whole)
+
+
+def test_a_fault_in_a_stop_that_was_asked_for_counts_from_itself_on():
+    async def scenario(bench):
+        move = await bench.begin()
+        await asyncio.sleep(1.0)
+        bench.motion.request("stop")
+        await asyncio.sleep(0.055)
+        found_from_s = bench.loop.time()
+        bench.bus.changes["following_error_mm"] = 2.0 * (np.arange(12) == 4)
+        stop = (await move).stop
+        assert 0.0 <= stop.found_s - found_from_s <= CYCLE_S
+        assert stop.commanded_s == stop.found_s
+
+    on_bench(scenario)
+
+
+def test_an_axis_that_drifts_in_a_hold_is_braked_and_told_as_drift():
+    async def scenario(bench):
+        move = await bench.begin()
+        await asyncio.sleep(1.0)
+        bench.motion.request("hold")
+        await asyncio.sleep(1.5 / PLAN.rate_slew_per_s + 0.5)
+        while not move.done():
+            bench.bus.offset_mm = bench.bus.offset_mm + 0.001 * (np.arange(12) == 7) * (bench.bus.brakes == 0)
+            bench.bus.changes["t_s"] = bench.loop.time()
+            await asyncio.sleep(CYCLE_S)
+        result = await move
+        assert isinstance(result.cause, AxisDrift)
+        assert result.cause.where == "C.Y"
+        assert abs(bench.bus.offset_mm[7]) <= 0.02 + 0.001 * (2 + round(bench.bus.brake_s / CYCLE_S))
+        assert (bench.bus.quick_stops, bench.bus.brakes) == (1, 1)
+        assert bench.motion.arbiter.mode is Mode.OFF
+
+    on_bench(scenario)
+
+
+def test_brakes_wait_for_axes_that_still_move():
+    """Emergency stop in motion: every drive ramps down by itself, then, once all are seen at rest, brakes close."""
+
+    async def scenario(bench):
+        move = await bench.begin()
+        await asyncio.sleep(1.003)
+        stopped_s = bench.loop.time()
+        bench.motion.report(Finding(Trigger.EMERGENCY_STOP, AxisNotEnabled("cell")))
+        assert bench.bus.quick_stops == 1
+        rolling_s = 0.06
+        while bench.loop.time() - stopped_s < rolling_s:
+            bench.bus.offset_mm = bench.bus.offset_mm + 0.05
+            await asyncio.sleep(CYCLE_S)
+            assert bench.motion._braking.waits
+        result = await move
+        assert bench.bus.brakes == 1
+        took_s = bench.loop.time() - stopped_s
+        assert rolling_s + bench.bus.brake_s < took_s <= rolling_s + bench.bus.brake_s + 8 * CYCLE_S
+        assert result.stop.commanded_s == result.stop.found_s == stopped_s
+
+    on_bench(scenario)
+
+
+def test_an_axis_that_lost_its_reference_is_not_enabled_until_a_supervisor_acknowledges():
+    async def scenario(bench):
+        move = await bench.begin()
+        await asyncio.sleep(1.0)
+        bench.bus.offset_mm = 5.0 * (np.arange(12) == 3)
+        result = await move
+        assert isinstance(result.cause, EncoderJump)
+        await asyncio.sleep(0.1)
+        with pytest.raises(AxisUnreferenced, match=r"B\.X"):
+            await bench.motion.enable()
+        with pytest.raises(EventRefused, match=r"B\.X lost its reference"):
+            await bench.motion.reset("operator")
+        with pytest.raises(AxisUnreferenced):
+            await bench.motion.enable()
+        await asyncio.sleep(1.0)
+        await bench.motion.reset("supervisor")
+        sent = len(bench.bus.sent)
+        with pytest.raises(PlanStale):
+            await bench.motion.start(PLAN.plan_hash)
+        assert len(bench.bus.sent) == sent
+        await bench.motion.enable()
+
+    on_bench(scenario)
+
+
+def test_the_work_before_a_move_is_done_just_after_a_tick():
+    async def scenario(bench):
+        await bench.motion.enable()
+        await asyncio.sleep(0.0037)
+        begun_s, watch_about = [], bench.motion._watch.watch_about
+
+        def watched(*args, **how):
+            begun_s.append(bench.loop.time())
+            watch_about(*args, **how)
+
+        bench.motion._watch.watch_about = watched
+        await bench.motion.load(PLAN)
+        assert begun_s == [bench.bus.sent_at_s[-1]]
+
+    on_bench(scenario)
+
+
+LIGHT = replace(LOAD, mass_kg=40.0, com_C_mm=POSITIONERS.balls_C_mm.mean(axis=0))
+
+
+class Weighed(Bench):
+    """The same with a load cell under every axis, all reading `force_n`."""
+
+    def __init__(self):
+        super().__init__()
+        limits = replace(LIMITS, measured_whole_force_n=1000.0, overload=99.0, underload=1e-6, rating=9.0)
+        limits = replace(limits, standing_force_n=200.0, measured_force_n=1000.0)
+        watch = Watch(POSITIONERS, LIGHT, limits, np.ones(12, dtype=bool))
+        self.motion = StreamedMotion(self.bus, watch, LATE_CYCLES)
+        self.resting = axis_forces_n(POSITIONERS, stress_free_n(PLAN.q_mm[0]))
+
+    def weigh(self, row=0, value=0.0):
+        self.bus.changes = {"force_n": self.resting + value * (np.arange(12) == row), "t_s": self.loop.time()}
+
+
+def stress_free_n(q_mm):
+    """Ball forces (k, 3) that carry the part."""
+    X_WC = pose_from_axes(POSITIONERS, q_mm)
+    balls = X_WC.apply(POSITIONERS.balls_C_mm)
+    centre = balls.mean(axis=0)
+    weight_n = LIGHT.mass_kg * LIGHT.gravity_m_s2
+    return ball_reactions_n(POSITIONERS, balls - centre, X_WC.apply(LIGHT.com_C_mm) - centre, weight_n)[0]
+
+
+def test_a_strained_part_is_refused_at_load_and_a_changed_force_at_start_and_resume():
+    async def main():
+        bench = Weighed()
+        bench.weigh(3, 1050.0)
+        await bench.motion.enable()
+        with pytest.raises(MeasuredForceTrip, match="docking relieve") as caught:
+            await bench.motion.load(PLAN)
+        assert caught.value.limit == 1000.0
+        assert not bench.motion.arbiter.latched, "nothing has happened that would have to be reset"
+        with pytest.raises(PlanStale):
+            await bench.motion.start(PLAN.plan_hash)
+        await bench.motion.load(replace(PLAN, kind="relief"))
+        for _ in range(20):
+            bench.weigh()
+            await asyncio.sleep(0.05)
+        await bench.motion.load(PLAN)
+        bench.weigh(3, 250.0)
+        await asyncio.sleep(0.05)
+        with pytest.raises(MeasuredForceTrip, match="measure again"):
+            await bench.motion.start(PLAN.plan_hash)
+        bench.weigh()
+        await asyncio.sleep(0.05)
+        await bench.motion.load(PLAN)
+        move = bench.loop.create_task(bench.motion.start(PLAN.plan_hash))
+        for cycle in range(300):
+            bench.weigh()
+            if cycle == 100:
+                bench.motion.request("hold")
+            await asyncio.sleep(CYCLE_S)
+        # Between two samples: only the resume itself can see it.
+        bench.weigh(3, 250.0)
+        await asyncio.sleep(0.011)
+        bench.motion.request("resume")
+        result = await move
+        assert isinstance(result.cause, MeasuredForceTrip), result.cause
+        assert "measure again" in result.cause.text()
+        assert len({tuple(row) for row in bench.bus.sent[-10:]}) == 1, "it was not resumed"
+        await bench.motion.close()
+
+    run_virtual(main)

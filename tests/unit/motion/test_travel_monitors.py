@@ -359,3 +359,40 @@ def test_margins_tell_how_near_each_monitor_came():
     assert bench.watch.margins()["following_error"] == pytest.approx(1.8)
     bench.cycle(at + 0.12, at + 0.12, np.full(12, 0.7))
     assert bench.watch.margins()["following_error"] == pytest.approx(1.8)
+
+
+@pytest.mark.parametrize("speed", [0.05, 0.15, -0.1])
+def test_an_axis_that_creeps_in_a_hold_has_drifted_and_is_not_stuck(speed):
+    """The move goes on, its commands stand: after 0.02 mm the axis is told to move without a command."""
+    bench = Bench()
+    at = ramp(bench, 4.0, 5)
+    finding, cycle = None, 0
+    while finding is None and cycle < 100:
+        cycle += 1
+        creep = one(7, speed * CYCLE_S * max(0, cycle - 40))
+        finding = bench.cycle(at + creep, at, -creep)
+    assert finding is not None
+    assert finding.trigger is Trigger.DRIFT
+    assert isinstance(finding.error, AxisDrift)
+    assert (finding.error.where, finding.error.limit) == ("C.Y", 0.02)
+    assert 0.02 < abs(finding.error.value) <= 0.02 + 1.5 * abs(speed) * CYCLE_S
+
+
+def test_a_hold_begins_anew_after_every_command():
+    """What an axis gave way before it was told to go on is no drift of the next hold."""
+    bench = Bench()
+    at = ramp(bench, 4.0, 5)
+    off = np.zeros(12)
+    for _ in range(3):
+        for k in range(50):
+            off = one(7, off[7] + (0.0003 if k > 10 else 0.0))
+            assert bench.cycle(at + off, at, -off) is None
+        at, off = at + 0.04, np.zeros(12)
+        assert bench.cycle(at, at, np.full(12, 0.008)) is None
+
+
+def test_a_hold_of_ten_seconds_of_healthy_axes_is_no_drift():
+    bench, rng = Bench(), np.random.default_rng(3)
+    at = ramp(bench, 4.0, 5)
+    for _ in range(1000):
+        assert bench.cycle(at + rng.uniform(-0.001, 0.001, 12), at) is None

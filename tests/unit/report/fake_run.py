@@ -306,6 +306,7 @@ def faulted_run() -> FakeRun:
         value=0.62,
         limit=0.5,
         remedy="Look for a jam, a closed brake or an overload on this axis. Measure again before moving.",
+        stop={"found_s": 75.0, "commanded_after_s": 0.011, "rest_after_s": 0.214},
     )
     run.go("faulted", "fault")
     run.finish("fault")

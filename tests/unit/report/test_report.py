@@ -224,6 +224,7 @@ def test_faulted_run_shows_the_alarm_and_what_to_do(tmp_path: Path) -> None:
     assert "Fault The run ended with a fault" in text
     assert "2101 C.Z: following error 0.62 mm is over the limit 0.5 mm." in text
     assert "Look for a jam" in text
+    assert "Found at 0:01:15 · first changed command after 11 ms · at rest after 214 ms" in text
     assert "The run ended before acceptance" in text
     assert "Result stopped" in text
     assert "Docked" not in text
