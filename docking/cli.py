@@ -117,18 +117,20 @@ def plan(cell: Path, job: Path | None, start: str | None, seed: int | None, plot
 @click.option(
     "--journal", type=FILE, help="Keep the journal in this file (default: beside the report, else temporary)."
 )
+@click.option("--scenario", type=FILE, help="Let the faults in this TOML file happen to the simulated devices.")
 @json_option
-def dry_run(cell: Path, job: Path | None, seed: int, report: Path | None, journal: Path | None, as_json: bool) -> int:
+def dry_run(cell: Path, job: Path | None, seed: int, as_json: bool, **files: Path | None) -> int:
     """Dock against simulated devices in virtual time: real state machine, real drivers, real bytes.
 
     \b
-    Example: docking dry-run sim/cells/fuselage-can.toml --seed 7 --report report.html
+    Examples: docking dry-run sim/cells/fuselage-can.toml --seed 7 --report report.html
+              docking dry-run sim/cells/lab-can.toml --scenario sim/scenarios/crane-moves-in.toml
     """
     from docking import assemble
 
-    say = _say(as_json)
-    summary = assemble.dry_run(assemble.RunRequest(cell, job, seed, report, journal, language()), say)
-    return _ended(summary, as_json)
+    report, journal, scenario = files["report"], files["journal"], files["scenario"]
+    request = assemble.RunRequest(cell, job, seed, report, journal, language(), scenario)
+    return _ended(assemble.dry_run(request, _say(as_json)), as_json)
 
 
 @cli.command()
@@ -203,7 +205,8 @@ def relieve(as_json: bool, supervisor: str, after: Path | None, sim: bool, wires
 @click.option("--seed", type=SEED, default=1, show_default=True, help="Seed of the simulated errors.")
 @click.option("--wires", type=FILE, help="Write the addresses of the wires to this JSON file.")
 @click.option("--trace", type=FILE, help="Record commanded and actual position of every axis in this CSV file, 100 Hz.")
-def sim(cell: Path, job: Path | None, seed: int, wires: Path | None, trace: Path | None) -> int:
+@click.option("--scenario", type=FILE, help="Let the faults in this TOML file happen, by time (at_s) only.")
+def sim(cell: Path, job: Path | None, seed: int, **files: Path | None) -> int:
     """Serve the simulated devices of a cell on real wires until interrupted.
 
     \b
@@ -211,7 +214,8 @@ def sim(cell: Path, job: Path | None, seed: int, wires: Path | None, trace: Path
     """
     from docking import assemble
 
-    assemble.serve(assemble.RunRequest(cell, job, seed, None, None, language()), wires, _say(False), trace)
+    request = assemble.RunRequest(cell, job, seed, None, None, language(), files["scenario"])
+    assemble.serve(request, files["wires"], _say(False), files["trace"])
     return EXIT_OK
 
 
@@ -300,7 +304,11 @@ def _summary_text(summary: dict[str, Any]) -> str:
         lines.append(tell(language(), "features", **summary))
     if summary["true_max_feature_error_mm"] is not None:
         lines.append(tell(language(), "truth", **summary))
-    return "\n".join([*lines, tell(language(), "moves", **summary)])
+    lines.append(tell(language(), "moves", **summary))
+    met = summary.get("scenario", {}).get("as_expected")
+    if met is not None:
+        lines.append(tell(language(), "scenario_met") if met else tell(language(), "scenario_missed"))
+    return "\n".join(lines)
 
 
 def _error_json(error: DockingError) -> dict[str, Any]:

@@ -7,7 +7,7 @@ the first frame of its move leaves.
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -26,57 +26,24 @@ from docking.errors import (
     TooFewPoints,
 )
 from docking.independent_points import IndependentPoints
-from docking.kinematics import Positioners, ball_reactions_n, figure_residual_mm, pose_from_axes, sink_mm
-from docking.motion.settle import SettleSettings, settle
+from docking.kinematics import ball_reactions_n, figure_residual_mm, pose_from_axes, sink_mm
+from docking.motion.settle import settle
 from docking.motion.weighing import weigh
 from docking.permissives import Permissives
-from docking.planning import Action, GuardSettings, PlanRequest, PlanSettings, check_correction, make_plan, retreat_plan
+from docking.planning import Action, PlanRequest, check_correction, make_plan, retreat_plan
 from docking.ports import Journal, Motion, Operator
 from docking.pose import fit_pose, screen
+from docking.procedure_settings import ProcedureSettings
 from docking.progress import Progress, stop_of
 from docking.state import Effect, Event
-from docking.survey import Nominals, Survey, SurveySettings
-from docking.types import Array, Fit, InputState, Plan, Pose
+from docking.survey import Survey
+from docking.types import Array, Fit, Plan
 
 START_TOLERANCE_MM = 0.05
 """How far an axis may stand from where its plan begins."""
 
 UNSEEN = (TargetLost, TooFewPoints, DegenerateTargets)
 """The component cannot be measured, as with a blocked line of sight: a person clears it, or retreats without a fit."""
-
-
-@dataclass(frozen=True, eq=False)
-class ProcedureSettings:
-    """What the procedure needs of the files, besides the stages' own settings.
-
-    `enabling` are the devices that a person holds in every move; `measured` says what the inputs change.
-    """
-
-    positioners: Positioners
-    plan: PlanSettings
-    guard: GuardSettings
-    settle: SettleSettings
-    X_WT: Pose
-    X_WM: Pose
-    period_s: float
-    linear_interpolation: bool
-    drift_mm_per_s: float
-    target_residual_mm: float
-    rms_limit_mm: float | None
-    plausibility_mm: float
-    fit_age_s: float
-    enabling: tuple[str, ...] = ()
-    measured: Callable[[InputState], Measured | None] = lambda state: None
-
-
-@dataclass(frozen=True, eq=False)
-class Measured:
-    """What temperature sensors change: nominal points, fits and geometry; `records` says by how much."""
-
-    nominals: Nominals
-    survey: SurveySettings
-    approach: Approach
-    records: tuple[dict[str, Any], ...]
 
 
 class Procedure:
@@ -111,6 +78,11 @@ class Procedure:
             Effect.MOVE: self._move,
             Effect.SETTLE: self._settle,
         }
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """Names of the stations, in order."""
+        return tuple(station.name for station in self._approach.stations)
 
     def alarm(self, error: DockingError) -> None:
         """Keep an error in the journal and tell the operator."""
@@ -156,7 +128,8 @@ class Procedure:
         for record in changed.records:
             read_c = record["read_c"]
             self.journal.write("temperature", {**record, "read_c": read_c if np.isfinite(read_c) else None})
-            self.operator.notify("temperature", **record)
+            if record["part"] != "floor":
+                self.operator.notify("temperature", **record, sensor=f"{read_c:.1f}" if np.isfinite(read_c) else "-")
 
     async def _measure(self) -> Event:
         p = self.progress
@@ -222,6 +195,7 @@ class Procedure:
     def _check_against_axes(self, fit: Fit) -> None:
         """The fitted pose must put the balls where the loaded sockets are: finds swapped axes and wrong frames."""
         positioners, load, X_WC = self._settings.positioners, self._settings.plan.load, fit.X_MN
+        positioners = replace(positioners, balls_C_mm=fit.grown(positioners.balls_C_mm))
         balls = X_WC.apply(positioners.balls_C_mm)
         weight = load.mass_kg * load.gravity_m_s2
         reactions = ball_reactions_n(positioners, balls, X_WC.apply(load.com_C_mm), weight)[0]
@@ -251,7 +225,6 @@ class Procedure:
             error_mm=float(errors.norm_mm[i]),
             sigma_mm=float(errors.sigma_mm[i]),
             tolerance_mm=float(errors.tolerance_mm[i]),
-        positioners = replace(positioners, balls_C_mm=fit.grown(positioners.balls_C_mm))
         )
         last = p.passes >= self._approach.convergence.max_passes
         agree = self._independent.check_points(fit, last=last) and self._independent.features(fit, mate, last=last)
@@ -297,6 +270,8 @@ class Procedure:
             scene=self._approach.scene(self._component_fit(), self._mate_fit(), station),
         )
         p.plan = await self._survey.aside(lambda: make_plan(request, self._settings.positioners, self._settings.plan))
+        goal, rule = self._approach.docked_goal(self._component_fit(), self._mate_fit()), self._approach.goal
+        self.journal.write("goal", records.goal_record(goal, rule, self._approach.features.names, station.name))
         self.journal.write("plan", records.plan_record(p.plan))
         return Event.PLANNED
 

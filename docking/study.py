@@ -21,7 +21,8 @@ from typing import Any
 
 from scipy import special
 
-from docking.assemble.runs import Files, RunRequest, dry_run_files, load_files
+from docking.assemble.requests import Files, RunRequest, load_files
+from docking.assemble.runs import dry_run_files
 from docking.assemble.simulated import truth_of, truth_path
 from docking.config import JobFile
 from docking.config.load import file_sha256

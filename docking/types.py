@@ -99,11 +99,15 @@ class Points(_Frozen):
 
 @dataclass(frozen=True)
 class Rejection:
-    """A point left out of the fit: which, why (`reason` is a short stable word), and the numbers in `detail`."""
+    """A point left out of the fit: which, why (`reason` is a short stable word), and the numbers in `detail`.
+
+    `partner` is the point at whose place it was measured, where that is what happened.
+    """
 
     name: str
     reason: str
     detail: str = ""
+    partner: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,11 +152,20 @@ class Fit(_Frozen):
     expansion: float = 0.0
     expansion_cov: Array | None = None
 
+    @property
+    def redundancy(self) -> int:
+        """Points beyond the three that define a pose: 0 means that nothing in the fit can prove it wrong."""
+        return max(len(self.names) - 3, 0)
+
     def predict(self, p_N_mm: ArrayLike) -> Array:
         """Where the points `p_N_mm` (..., 3) of the fitted body are in M, its expansion about the pivot included."""
         q = self.X_MN.apply(p_N_mm)
         result: Array = q + self.expansion * (q - self.pivot_mm)
         return result
+
+    def grown(self, p_N_mm: ArrayLike) -> Array:
+        """Points `p_N_mm` (..., 3) of the fitted body in N with its expansion: `X_MN` takes them to `predict`."""
+        return self.X_MN.inverse().apply(self.predict(p_N_mm))
 
     def whole_cov(self) -> Array:
         """Covariance (7, 7) of pose and expansion; zero in its last row where the expansion was not estimated."""
@@ -162,10 +175,6 @@ class Fit(_Frozen):
             cov[6, :] = cov[:, 6] = self.expansion_cov
         return cov
 
-
-    def grown(self, p_N_mm: ArrayLike) -> Array:
-        """Points `p_N_mm` (..., 3) of the fitted body in N with its expansion: `X_MN` takes them to `predict`."""
-        return self.X_MN.inverse().apply(self.predict(p_N_mm))
 
 RISK_LIMIT = 0.025
 """Largest probability, given what was measured, that any docking feature of an accepted docking is out of tolerance."""
@@ -265,6 +274,7 @@ class Plan(_Frozen):
     speed_limited_by: str
     margins: tuple[tuple[str, float, float], ...] = ()
     bounds: PlanBounds | None = None
+    requires: tuple[str, ...] = ()
 
     @property
     def duration_s(self) -> float:
@@ -274,7 +284,6 @@ class Plan(_Frozen):
     def displacement_mm(self) -> Array:
         result: Array = self.q_mm[-1] - self.q_mm[0]
         return result
-    requires: tuple[str, ...] = ()
 
 
 class AxisState(Enum):
@@ -329,15 +338,6 @@ class Feedback:
 
 
 @dataclass(frozen=True)
-class Identity:
-    """Who answered on a wire: `where` (tracker, axis A.X, positioner A) and what it says of itself."""
-
-    where: str
-    vendor: str
-    product: str
-    serial: str
-    firmware: str
-@dataclass(frozen=True)
 class InputState:
     """What the wired inputs of a cell say, by name.
 
@@ -351,6 +351,15 @@ class InputState:
     silent: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class Identity:
+    """Who answered on a wire: `where` (tracker, axis A.X, positioner A) and what it says of itself."""
+
+    where: str
+    vendor: str
+    product: str
+    serial: str
+    firmware: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,6 +378,16 @@ class Trace:
     measured_force_n: Array
 
 
+@dataclass(frozen=True)
+class StopTimes:
+    """A stop in loop time: the finding or request that asked for it, the first command that differs for it, and when
+    the read-backs showed all axes at rest. NaN where that was not seen."""
+
+    found_s: float
+    commanded_s: float
+    rest_s: float
+
+
 @dataclass(frozen=True, eq=False)
 class MoveResult:
     """How a move ended: `done`, `stopped` (on request, on the path) or `fault` (with its `cause`).
@@ -385,6 +404,7 @@ class MoveResult:
     max_residual_mm: float
     max_internal_force_n: float
     cause: Exception | None = None
+    stop: StopTimes | None = None
 
 
 @dataclass(frozen=True)
@@ -395,18 +415,7 @@ class Alarm:
     message: str
     where: str = ""
     value: float | str | None = None
-@dataclass(frozen=True)
-class StopTimes:
-    """A stop in loop time: the finding or request that asked for it, the first command that differs for it, and when
-    the read-backs showed all axes at rest. NaN where that was not seen."""
-
-    found_s: float
-    commanded_s: float
-    rest_s: float
-
-
     limit: float | str | None = None
     remedy: str = ""
     t_s: float = field(default=float("nan"))
-    stop: StopTimes | None = None
     stop: StopTimes | None = None

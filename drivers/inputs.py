@@ -11,6 +11,8 @@ from docking.errors import BadReply
 from docking.types import Identity, InputState
 
 _ROUNDING_S = 1e-6
+SILENT_AFTER = 3.0
+"""Refresh times or polls without a fresh word after which the inputs of a module are not known."""
 TOLD_K = 0.05
 """Temperatures that changed by less are no news."""
 

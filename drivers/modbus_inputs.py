@@ -9,11 +9,10 @@ from collections.abc import Callable
 from docking.config.inputs import ModbusModule
 from docking.errors import BadReply, DockingError, WrongIdentity
 from docking.types import Identity
+from drivers.inputs import SILENT_AFTER
 from drivers.maps.io_modules import load_modbus_io
 from drivers.modbus_client import ModbusUnit
 
-SILENT_AFTER = 3.0
-"""Polls without a fresh answer after which the inputs are not known."""
 AGAIN_S = 1.0
 """Longest wait before a lost connection is tried again."""
 

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from docking.assemble.motion_process import run_motion
     from docking.assemble.relieving import ReliefRequest, relieve
-    from docking.assemble.runs import RunRequest, WireChoice, dry_run, run_on_wires, serve
+    from docking.assemble.requests import RunRequest, WireChoice
+    from docking.assemble.runs import dry_run, run_on_wires
+    from docking.assemble.serving import serve
 
 __all__ = ["ReliefRequest", "RunRequest", "WireChoice", "dry_run", "relieve", "run_motion", "run_on_wires", "serve"]
 
@@ -24,6 +26,10 @@ def __getattr__(name: str) -> Any:
         from docking.assemble import relieving
 
         return getattr(relieving, name)
+    if name == "serve":
+        from docking.assemble import serving
+
+        return serving.serve
     if name in __all__:
         from docking.assemble import runs
 

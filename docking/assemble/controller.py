@@ -35,7 +35,8 @@ from docking.kinematics import Positioners
 from docking.motion.settle import SettleSettings
 from docking.ports import Aside, Journal, Motion, Operator, SerialLink, Tracker, at_once
 from docking.pose import Features, FitSettings
-from docking.procedure import Measured, Procedure, ProcedureSettings
+from docking.procedure import Procedure
+from docking.procedure_settings import Measured, ProcedureSettings
 from docking.survey import Nominals, Survey, SurveySettings
 from docking.types import Array, InputState
 from drivers.geocom_tracker import GeocomTracker

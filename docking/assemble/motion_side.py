@@ -19,7 +19,7 @@ from docking.ports import CanLink
 from drivers.canopen.io_module import CanIoModule
 from drivers.canopen.positioners import CanopenPositioners
 from drivers.canopen.shared import SharedCan
-from drivers.inputs import InputModule, WiredInputs
+from drivers.inputs import SILENT_AFTER, InputModule, WiredInputs
 from drivers.maps.objects import load_object_map
 from drivers.modbus_inputs import ModbusIoModule
 from drivers.modbus_positioners import ModbusPositioners
@@ -67,6 +67,9 @@ def input_rules(inputs: InputsConfig) -> InputRules:
     return InputRules(
         emergency=inputs.names("emergency-stop"),
         protective=inputs.names("protective-stop"),
+        silent_s={
+            m.name: SILENT_AFTER * (m.poll_s if isinstance(m, ModbusModule) else m.refresh_s) for m in inputs.modules
+        },
         limits=of_axes["limit-switch"],
         brakes=of_axes["brake-closed"],
     )

@@ -14,7 +14,7 @@ import numpy as np
 
 from docking.assemble.controller import Company
 from docking.assemble.real_time import on_interrupt, run_real
-from docking.assemble.runs import Files, RunRequest, Say, WireChoice, journal_path, load_files, read_wires
+from docking.assemble.requests import Files, RunRequest, Say, WireChoice, journal_path, load_files, read_wires
 from docking.assemble.simulated import make_far_end, real_wires, truth_of
 from docking.assemble.spawned import MotionProcess
 from docking.cell import Cell

@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-import errno
-import json
-import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from docking.assemble.controller import Company, Wires, build_cell
 from docking.assemble.real_time import aside, on_interrupt, run_real
+from docking.assemble.requests import Files, RunRequest, Say, WireChoice, journal_path, load_files, read_wires, writing
+from docking.assemble.scenarios import WatchedJournal, as_expected, event_facts, runner_of, scenario_of
 from docking.assemble.simulated import FarEnd, make_far_end, real_wires, truth_of, virtual_wires
 from docking.assemble.spawned import MotionProcess
 from docking.cell import Cell
-from docking.config import CellFile, JobFile
-from docking.config.inputs import ModbusModule
-from docking.config.load import default_job_path, file_sha256, load_cell, load_job
-from docking.errors import BadArgument, FileUnreadable, FileUnwritable
+from docking.config.load import file_sha256
 from docking.journal import JournalFile, read
 from docking.operators import AutomaticOperator, TerminalOperator
 from docking.ports import Journal, Motion, Operator, at_once
@@ -31,8 +26,8 @@ from docking.progress import Progress
 from docking.records import alarm_record
 from docking.state import Event, State
 from docking.version import VERSION
-from docking.words import tell
 from drivers.links.serial_port import SerialPort
+from sim.scenario import EventModel, ScenarioFile
 from sim.truth import TruthFile
 from sim.virtual_time import run_virtual
 
@@ -46,54 +41,19 @@ DECISION_RULE = (
     "e + 2 sigma <= tolerance for every docking feature (ISO 14253-1, k = 2), "
     "and at most 2.5 % risk that any feature is out of tolerance (JCGM 106)"
 )
-LOOPBACK = ("127.0.0.1", "::1", "localhost")
-Say = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class RunRequest:
-    """What one run is asked to do: files, seed of the simulation, where report and journal go, language."""
-
-    cell_path: Path
-    job_path: Path | None
-    seed: int
-    report: Path | None
-    journal: Path | None
-    language: str
-
-
-@dataclass(frozen=True)
-class WireChoice:
-    """Which wires: simulated ones (`sim`), at the addresses in `wires` or started for this run."""
-
-    sim: bool
-    wires: Path | None
-
-
-@dataclass(frozen=True)
-class Files:
-    """The loaded files of a run."""
-
-    cell: CellFile
-    job: JobFile
-    job_path: Path
-
-
-def load_files(request: RunRequest) -> Files:
-    """Load and check both files; raises ConfigError with all problems."""
-    cell = load_cell(request.cell_path)
-    job_path = request.job_path or default_job_path(request.cell_path)
-    return Files(cell, load_job(job_path, cell), job_path)
 
 
 def dry_run(request: RunRequest, say: Say) -> dict[str, Any]:
     """Dock in virtual time; returns the summary, writes journal and report."""
     files = load_files(request)
+    scenario = scenario_of(request.scenario, request.cell_path)
     truth = truth_of(request.cell_path)
-    return dry_run_files(files, truth, request, say)
+    return dry_run_files(files, truth, request, say, scenario)
 
 
-def dry_run_files(files: Files, truth: TruthFile, request: RunRequest, say: Say) -> dict[str, Any]:
+def dry_run_files(
+    files: Files, truth: TruthFile, request: RunRequest, say: Say, scenario: ScenarioFile | None = None
+) -> dict[str, Any]:
     """`dry_run` with files already loaded and a truth of the caller's choice (studies)."""
     with ExitStack() as stack:
         path = journal_path(request, stack)
@@ -102,7 +62,7 @@ def dry_run_files(files: Files, truth: TruthFile, request: RunRequest, say: Say)
             far = make_far_end(files.cell, files.job, truth, request.seed)
             wires = await virtual_wires(files.cell, far)
             operator = AutomaticOperator(say, request.language)
-            return await _dock(_Run(files, request, wires, operator, path, far, simulated=True))
+            return await _dock(_Run(files, request, wires, operator, path, far, simulated=True, scenario=scenario))
 
         summary = run_virtual(main)
         return _finish(request, path, summary)
@@ -137,39 +97,6 @@ def run_on_wires(request: RunRequest, choice: WireChoice, say: Say, *, step: boo
         return _finish(request, path, run_real(main, ticks=own_devices))
 
 
-def serve(request: RunRequest, wires_file: Path | None, say: Say, trace: Path | None = None) -> None:
-    """Serve the simulated devices of a cell on real wires until interrupted; `trace` records how the axes move."""
-    files = load_files(request)
-    for path in (wires_file, trace):
-        if path is not None:
-            _prepare(path)
-    with tempfile.TemporaryDirectory(prefix="docking-sim-") as folder:
-
-        async def main() -> None:
-            far = make_far_end(files.cell, files.job, truth_of(request.cell_path), request.seed)
-            found = await real_wires(files.cell, far, Path(folder))
-            if trace is not None:
-                with _writing(trace):
-                    far.trace(trace)
-            asked_to_end = asyncio.Event()
-            on_interrupt(asked_to_end.set)
-            text = json.dumps(found, indent=2)
-            if wires_file is not None:
-                # Written whole and then renamed: a reader never meets half a file.
-                part = wires_file.with_suffix(".part")
-                with _writing(wires_file):
-                    part.write_text(text + "\n", "utf-8")
-                    part.replace(wires_file)
-            say(text)
-            say(tell(request.language, "served"))
-            try:
-                await asked_to_end.wait()
-            finally:
-                await far.close()
-
-        run_real(main)
-
-
 @dataclass(frozen=True)
 class _Joined:
     """The motion process of a run, and where it finds simulated devices."""
@@ -189,18 +116,23 @@ class _Run:
     simulated: bool
     joined: _Joined | None = None
     step: bool = False
+    scenario: ScenarioFile | None = None
 
 
 async def _dock(run: _Run) -> dict[str, Any]:
     """Dock once on the running loop and close the journal with the outcome."""
     loop = asyncio.get_running_loop()
     started_s, wall_s = loop.time(), time.perf_counter()
-    journal = JournalFile(run.journal_path, loop.time)
+    journal: Journal = JournalFile(run.journal_path, loop.time)
+    watched = WatchedJournal(journal, run.far) if run.scenario is not None and run.far is not None else None
+    journal = watched or journal
     try:
         journal.write("run_started", _started(run), durable=True)
         company = Company(journal, run.operator, loop.time, aside if run.joined else at_once, run.step)
         motion = await _joined_motion(run, run.joined, journal) if run.joined else None
         cell = build_cell(run.files.cell, run.files.job, run.wires, company, motion)
+        if watched is not None:
+            _let_happen(run, cell, watched)
         run.operator.attend(cell.post, cell.override)
         if run.joined:
             on_interrupt(lambda: _abort(cell, run.operator))
@@ -211,10 +143,29 @@ async def _dock(run: _Run) -> dict[str, Any]:
                 journal.write("motion_process", await run.joined.process.end())
         times = (loop.time() - started_s, time.perf_counter() - wall_s)
         summary = _summary(run, cell, state, times)
+        if run.scenario is not None:
+            met = as_expected(run.scenario, summary["outcome"], summary["alarms"])
+            summary["scenario"] = {"name": run.scenario.name, "as_expected": met}
         journal.write("outcome", summary, durable=True)
         return summary
     finally:
         journal.close()
+
+
+def _let_happen(run: _Run, cell: Cell[Procedure], watched: WatchedJournal) -> None:
+    """Let the scenario of this run happen; every event is kept and told."""
+    path = run.request.scenario
+    if run.scenario is None or run.far is None or path is None:
+        return
+
+    def told(what: str, event: EventModel) -> None:
+        watched.write("scenario", {"what": what, **event_facts(event)})
+        if what == "begins":
+            run.operator.notify("scenario_begins", device=event.device, fault=event.fault)
+        else:
+            run.operator.notify("scenario_ends", device=event.device, fault=event.fault)
+
+    watched.watch(cell, runner_of(run.scenario, path, run.files.cell, run.far, told, run.files.job))
 
 
 async def _joined_motion(run: _Run, joined: _Joined, journal: Journal) -> Motion:
@@ -299,86 +250,6 @@ def _finish(request: RunRequest, journal_path: Path, summary: dict[str, Any]) ->
     if request.report is not None:
         from docking.report import write_report
 
-        with _writing(request.report):
+        with writing(request.report):
             write_report(read(journal_path), request.report, request.language)
     return summary
-
-
-def journal_path(request: RunRequest, stack: ExitStack) -> Path:
-    """Where the journal of this run goes: as asked, beside the report, or into a folder that ends with the run.
-
-    Raises FileUnwritable before anything moves where journal or report cannot be written.
-    """
-    if request.report is not None:
-        _prepare(request.report)
-    if request.journal is not None:
-        return _fresh(request.journal)
-    if request.report is not None:
-        return _fresh(request.report.with_suffix(".journal.jsonl"))
-    return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="docking-"))) / "journal.jsonl"
-
-
-def _fresh(path: Path) -> Path:
-    """One journal a run: an earlier one is kept beside it under the next free number."""
-    _prepare(path)
-    if path.exists():
-        n = 1
-        while (kept := path.with_name(f"{path.stem}.{n}{path.suffix}")).exists():
-            n += 1
-        with _writing(path):
-            path.rename(kept)
-    return path
-
-
-def _prepare(path: Path) -> None:
-    """Make the folder of a file that is to be written, and find out whether it can be."""
-    with _writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-        if not os.access(path.parent, os.W_OK):
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-
-
-@contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise FileUnwritable(str(path), (error.strerror or str(error)).lower()) from error
-
-
-def _refuse_real_devices(path: Path, found: dict[str, Any]) -> None:
-    """Simulated devices live on this machine: on a pty, a local socket, the loopback interface. Nothing else is moved
-    without a person."""
-    listed = found.get("modbus")
-    hosts = [str(at[0]) for at in listed.values() if at] if isinstance(listed, dict) else []
-    far = [host for host in hosts if host not in LOOPBACK]
-    tracker, can = str(found.get("tracker", "")), str(found.get("can", ""))
-    far += [tracker] if tracker and not tracker.startswith("/dev/pts/") else []
-    far += [can] if can and not Path(can).is_socket() else []
-    if far:
-        raise BadArgument("--wires", f"{far[0]} is no simulated device of this machine", value=str(path))
-
-
-def read_wires(path: Path, cell: CellFile) -> dict[str, Any]:
-    """The addresses that `docking sim` wrote. Raises FileUnreadable, BadArgument when they are not this cell's."""
-    try:
-        found = json.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise FileUnreadable(str(path), (error.strerror or str(error)).lower()) from error
-    except ValueError as error:
-        raise FileUnreadable(str(path), f"not JSON: {error}") from error
-    if not isinstance(found, dict) or found.get("cell") != cell.name:
-        raise BadArgument("--wires", f"the file is not for cell {cell.name}", value=str(path))
-    modules = cell.inputs.modules if cell.inputs is not None else ()
-    expected = {module.name for module in modules if isinstance(module, ModbusModule)}
-    queued = cell.bus.kind == "modbus-tcp"
-    expected |= {p.name for p in cell.positioners} if queued else set()
-    listed = found.get("modbus", {})
-    whole = isinstance(listed, dict) and set(listed) == expected and (queued or isinstance(found.get("can"), str))
-    _refuse_real_devices(path, found)
-    if not (whole and isinstance(found.get("tracker"), str)):
-        cause = "the file lacks addresses of this cell; let `docking sim` write it"
-        raise BadArgument("--wires", cause, value=str(path))
-    return found

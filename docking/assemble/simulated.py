@@ -58,6 +58,7 @@ class FarEnd:
     seed: int
     world: InputWorld
     devices: list[Any] = field(default_factory=list)
+    line: VirtualSerial | None = None
 
     def tracker(self, cell: CellFile, wire: DeviceEnd) -> None:
         """Put the instrument on a serial wire."""
@@ -127,7 +128,7 @@ def make_far_end(cell: CellFile, job: JobFile, truth: TruthFile, seed: int) -> F
 
 async def virtual_wires(cell: CellFile, far: FarEnd) -> Wires:
     """All devices on wires inside the process; returns the near ends."""
-    serial = VirtualSerial(far.loop, cell.tracker.baud)
+    far.line = serial = VirtualSerial(far.loop, cell.tracker.baud)
     far.tracker(cell, serial.far)
     if isinstance(cell.bus, CanBus):
         bus = VirtualCan(far.loop, cell.bus.bitrate)

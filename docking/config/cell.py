@@ -229,12 +229,12 @@ class LimitsConfig(Model):
         "mass have tolerances, N",
     )
     measured_whole_warp_n: Positive = Field(default=1200.0, description="the same for the warp, N")
-    overload_fraction: Annotated[float, Field(gt=1.0, le=3.0)] = Field(
     standing_force_n: Positive = Field(
         default=300.0,
         description="most that the measured internal force at a ball may change while the axes stand, between load and"
         " start and between hold and resume, N",
     )
+    overload_fraction: Annotated[float, Field(gt=1.0, le=3.0)] = Field(
         default=1.1, description="stop when a ball carries more than this times what it is expected to carry"
     )
     underload_fraction: Annotated[float, Field(gt=0.0, lt=1.0)] = Field(

@@ -29,10 +29,12 @@ from docking.types import Array, Feedback, Identity, InputState, MoveResult, Pla
 
 @dataclass(frozen=True)
 class InputRules:
-    """Which inputs are what: names, and for limit switches and brakes the axis of each name."""
+    """Which inputs are what: names, and for limit switches and brakes the axis of each name. `silent_s`: after how long
+    without a word each module is silent."""
 
     emergency: tuple[str, ...] = ()
     protective: tuple[str, ...] = ()
+    silent_s: dict[str, float] = field(default_factory=dict)
     limits: dict[str, str] = field(default_factory=dict)
     brakes: dict[str, str] = field(default_factory=dict)
 
@@ -143,7 +145,7 @@ class GuardedMotion:
             if given.get(name):
                 yield name, Finding(Trigger.PROTECTIVE_STOP, ProtectiveStop(name))
         for module in state.silent:
-            yield module, Finding(Trigger.INPUTS_SILENT, _silent(module))
+            yield module, Finding(Trigger.INPUTS_SILENT, self._silent(module))
         for name, axis in rules.limits.items():
             if given.get(name):
                 yield name, Finding(Trigger.LIMIT_SWITCH, AxisAtLimit(axis, f"input {name}"))
@@ -165,16 +167,16 @@ class GuardedMotion:
         for name in self._rules.protective:
             if state.given.get(name):
                 return ProtectiveStop(name)
-        return _silent(state.silent[0]) if state.silent else None
+        return self._silent(state.silent[0]) if state.silent else None
+
+    def _silent(self, module: str) -> DeviceSilent:
+        limit_s = self._rules.silent_s.get(module)
+        return DeviceSilent(f"input module {module}", "its inputs are not known any more", limit=limit_s)
 
     def _require_no_stop(self) -> None:
         error = self._stop()
         if error is not None:
             raise error
-
-
-def _silent(module: str) -> DeviceSilent:
-    return DeviceSilent(f"input module {module}", "its inputs are not known", limit="its refresh time")
 
 
 def _closed(given: bool | None) -> str:

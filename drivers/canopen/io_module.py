@@ -12,11 +12,10 @@ from docking.ports import CanFrame, CanLink
 from docking.types import Identity
 from drivers.canopen import codec
 from drivers.canopen.sdo import SdoClient
+from drivers.inputs import SILENT_AFTER
 from drivers.maps.io_modules import CanIoMap, InputPdo, load_can_io
 from drivers.maps.objects import ObjectEntry
 
-SILENT_AFTER = 3.0
-"""Refresh times without a frame after which the inputs are not known."""
 _COB_MASK = codec.COB_INVALID | 0x7FF
 
 
