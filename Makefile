@@ -5,8 +5,9 @@ BIN := $(VENV)/bin
 CELL ?= sim/cells/fuselage-can.toml
 RUNS ?= runs
 SEEDS ?= 100
+FUZZ_SECONDS ?= 60
 
-.PHONY: dock test lint bench study wires clean
+.PHONY: dock test lint bench study wires fuzz clean
 
 dock: $(VENV)/.installed
 	@mkdir -p $(RUNS)
@@ -34,6 +35,14 @@ study: $(VENV)/.installed-dev
 
 wires: $(VENV)/.installed-dev
 	$(BIN)/pytest -n 4 -m wires tests/e2e --all-cells
+
+# Each parser of the serial drivers under coverage-guided fuzzing for so long.
+fuzz: $(VENV)/.installed-dev
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[fuzz]'
+	@mkdir -p $(RUNS)
+	for parser in line geocom ndi vectornav; do \
+		$(BIN)/python -m tests.fuzz $$parser -max_total_time=$(FUZZ_SECONDS) -max_len=600 -artifact_prefix=$(RUNS)/ || exit 1; \
+	done
 
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

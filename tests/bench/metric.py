@@ -19,10 +19,18 @@ class Sizes:
     study_seeds: int = 24
     study_repeats: int = 3
     lateness_s: float = 60.0
+    tracker_frames: int = 5000
 
 
 TINY = Sizes(
-    repeats=1, stop_instants=1, dock_cell="lab-can", events_a_task=20, study_seeds=2, study_repeats=1, lateness_s=0.3
+    repeats=1,
+    stop_instants=1,
+    dock_cell="lab-can",
+    events_a_task=20,
+    study_seeds=2,
+    study_repeats=1,
+    lateness_s=0.3,
+    tracker_frames=50,
 )
 """Enough to see that everything runs; the ratios mean nothing."""
 

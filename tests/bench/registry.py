@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
-from tests.bench import fault_reaction, planning, stop_replan, stop_residual, study, tick_lateness, virtual_time
+from tests.bench import (
+    fault_reaction,
+    planning,
+    stop_replan,
+    stop_residual,
+    study,
+    tick_lateness,
+    tracker_frames,
+    virtual_time,
+)
 from tests.bench.metric import Group
 
 GROUPS: dict[str, Group] = {
+    "P1": tracker_frames.measure,
     "P3": planning.measure,
     "P4": stop_replan.measure,
     "P8": tick_lateness.measure,
