@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from docking.config.base import Finite, Model, Name, NonNegative, PoseVector, Positive, Vector3
+from docking.pose.goal import GoalKind, Lock
 
 
 class Target(Model):
@@ -113,12 +114,12 @@ class JobFile(Model):
     component: Component = Field(description="the part that moves")
     mate: Mate = Field(description="the part that stands")
     docking_axis: Vector3 = Field(description="unit vector of the insertion, in the mate frame M")
-    goal: Literal["least-squares", "minimax"] = Field(
+    goal: GoalKind = Field(
         default="least-squares",
         description="how the docked pose is fitted to the features: least squares weighted by their tolerances, or the "
         "smallest largest error in tolerances",
     )
-    goal_locks: tuple[Literal["x", "y", "z", "alpha", "beta", "gamma"], ...] = Field(
+    goal_locks: tuple[Lock, ...] = Field(
         default=(),
         description="degrees of freedom that the features do not decide: shifts along, rotations about the axes of M "
         "through the docking face; they stay as in docked_pose",

@@ -23,6 +23,7 @@ from docking.types import Array, Fit, Pose
 
 GoalKind = Literal["least-squares", "minimax"]
 Lock = Literal["x", "y", "z", "alpha", "beta", "gamma"]
+LOCKS: tuple[Lock, ...] = get_args(Lock)
 _PARAMETERS: tuple[str, ...] = ("alpha", "beta", "gamma", "x", "y", "z")
 _ROUNDS = 30
 _REST_MM = 1e-8
@@ -51,9 +52,6 @@ class GoalRule:
     def free(self) -> NDArray[np.intp]:
         """Indices of the parameters [alpha, beta, gamma, x, y, z] that the features decide."""
         return np.array([i for i, name in enumerate(_PARAMETERS) if name not in self.locks], dtype=np.intp)
-
-
-LOCKS: tuple[str, ...] = get_args(Lock)
 
 
 def best_fit(body_mm: Array, target_mm: Array, tolerance_mm: Array, rule: GoalRule) -> Pose:

@@ -114,7 +114,7 @@ def test_a_lock_keeps_its_degree_of_freedom_and_the_rest_is_best(kind: str, lock
 def test_all_locked_is_the_designed_pose_and_none_needs_no_design() -> None:
     body, target, tolerance = figures(7, 4)
     designed = Pose(euler_to_matrix(0.1, 0.0, 0.0), np.array([10.0, 0.0, 0.0]))
-    assert best_fit(body, target, tolerance, GoalRule("minimax", LOCKS, designed)) is designed  # type: ignore[arg-type]
+    assert best_fit(body, target, tolerance, GoalRule("minimax", LOCKS, designed)) is designed
     plain = best_fit(body, target, tolerance, GoalRule())
     told = best_fit(body, target, tolerance, GoalRule(docked=designed))
     assert np.allclose(plain.matrix(), told.matrix())
