@@ -81,8 +81,6 @@ class WiredInputs:
         self._sensors = config.temperatures
         self._state = InputState()
         self._timer: asyncio.TimerHandle | None = None
-        for module in modules.values():
-            module.on_change = self._look
 
     async def bring_up(self) -> tuple[Identity, ...]:
         """Prove every module in the order of the file. Raises LinkError, BadReply where a channel does not exist."""
@@ -91,6 +89,8 @@ class WiredInputs:
             _require(contact.config, contact.module.channels[0], "digital")
         for sensor in self._sensors:
             _require(sensor, self._modules[sensor.module].channels[1], "analogue")
+        for module in self._modules.values():
+            module.on_change = self._look
         self._look()
         return tuple(found)
 

@@ -32,7 +32,7 @@ class ModbusIoModule:
         self.unit = ModbusUnit(self.where, host, port, config.unit, config.timeout_s)
         self._levels = b""
         self._counts: tuple[int, ...] = ()
-        self._alive = -1
+        self._alive: int | None = None
         self._fresh_s = float("-inf")
         self._silent = True
         self._keeper: asyncio.Task[None] | None = None
@@ -80,7 +80,9 @@ class ModbusIoModule:
         if head["magic"] != self._map.magic:
             raise BadReply(self.where, "The word order differs.", value=f"{head['magic']:#x} for {self._map.magic:#x}")
         if head["map_version"] != self._map.version:
-            raise WrongIdentity(self.where, "Compared: map version.", value=head["map_version"], limit=self._map.version)
+            raise WrongIdentity(
+                self.where, "Compared: map version.", value=head["map_version"], limit=self._map.version
+            )
         return Identity(self.where, head["vendor"], head["product"], head["serial"], head["firmware"])
 
     async def _read(self) -> None:
@@ -94,12 +96,12 @@ class ModbusIoModule:
         self._take(levels, words[start : start + layout.analogue_inputs], words[layout.alive_at - first] & 0xFFFF)
 
     def _take(self, levels: bytes, counts: tuple[int, ...], alive: int) -> None:
-        fresh, first = alive != self._alive, self._alive < 0
-        self._alive = alive
         now_s = asyncio.get_running_loop().time()
-        if fresh:
+        # One answer proves nothing: only a counter that has moved says that the inputs are of now.
+        if self._alive is not None and alive != self._alive:
             self._fresh_s = now_s
-        silent = (self._silent and first) or not self._recent(now_s)
+        self._alive = alive
+        silent = not self._recent(now_s)
         changed = (levels, counts, silent) != (self._levels, self._counts, self._silent)
         self._levels, self._counts, self._silent = levels, counts, silent
         if changed:

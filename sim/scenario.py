@@ -44,7 +44,7 @@ class EventModel(Model):
     stage: Text | None = Field(default=None, description="only at this station")
     visit: Annotated[int, Field(ge=1)] = Field(default=1, description="at the n-th time that this is so")
     s: Annotated[float, Field(ge=0.0, le=1.0)] | None = Field(
-        default=None, description="with at_state = \"move\": at this fraction of the way"
+        default=None, description='with at_state = "move": at this fraction of the way'
     )
     after_s: NonNegative = Field(default=0.0, description="so long after the condition, s")
     for_s: Positive | None = Field(default=None, description="it is taken back after so long, s; without: never")

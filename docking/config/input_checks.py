@@ -78,6 +78,8 @@ def _contact(cell: CellFile, key: str, item: DigitalInput) -> list[Finding]:
     if item.use not in OF_AN_AXIS and item.axis is not None:
         findings.append(error(f"{key}.axis", f"'{item.use}' belongs to no axis"))
     if item.on != FAIL_SAFE.get(item.use, item.on):
-        text = f"{item.on!r}: a broken wire would not read as the safe answer; '{item.use}' is better wired to the other"
+        text = (
+            f"{item.on!r}: a broken wire would not read as the safe answer; '{item.use}' is better wired to the other"
+        )
         findings.append(warning(f"{key}.on", text))
     return findings

@@ -8,9 +8,7 @@ from pydantic import Field
 
 from docking.config.base import Finite, Model, Name, NonNegative, Positive
 
-Use = Literal[
-    "permissive", "emergency-stop", "protective-stop", "enabling-device", "limit-switch", "brake-closed"
-]
+Use = Literal["permissive", "emergency-stop", "protective-stop", "enabling-device", "limit-switch", "brake-closed"]
 AxisName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_\-]{0,31}\.[XYZ]$")]
 Channel = Annotated[int, Field(ge=0, le=255)]
 
