@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from docking.config.base import Finite, Fraction, Model, Name, NonNegative, PoseVector, Positive, Vector3
 from docking.config.inputs import InputsConfig
-from docking.config.instruments import GeocomConfig
+from docking.config.instruments import GeocomConfig, InertialConfig, NdiConfig
 
 
 class Noise(Model):
@@ -310,6 +310,8 @@ class CellFile(Model):
     schema_version: Literal[1] = Field(description="of this file format")
     name: Name = Field(description="of the cell")
     tracker: TrackerConfig = Field(description="the instrument")
+    camera: NdiConfig | None = Field(default=None, description="a camera that streams beside the instrument")
+    inertial: InertialConfig | None = Field(default=None, description="an inertial sensor on the component")
     bus: CanBus | ModbusBus = Field(discriminator="kind", description="the wire to the axes")
     positioners: tuple[PositionerConfig, ...] = Field(min_length=3, description="in the order of all axis lists")
     load_cells: LoadCellConfig | None = Field(

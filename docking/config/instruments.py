@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from docking.config.base import Finite, Model, Name
+from docking.config.base import Finite, Model, Name, PoseVector
 
 INERTIAL_LINE_BYTES = {"VNYMR": 140, "VNIMU": 125}
 """Longest line of each message, time stamp and checksum included."""
@@ -61,6 +61,9 @@ class NdiConfig(Model):
     )
     rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)] = Field(
         default=60.0, description="exposures a second: how fast the frames count up"
+    )
+    station_pose: PoseVector = Field(
+        default=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), description="approximate place of the camera in W, mm and deg"
     )
     strays: bool = Field(default=True, description="report markers that belong to no tool")
     tools: tuple[NdiToolConfig, ...] = Field(default=(), description="tools whose definition is loaded")

@@ -66,6 +66,8 @@ class _Handle:
 class NdiCamera:
     """The camera on `wire`, seeing `scene`. `roms`: definition -> tool of the scene; `plugged`: tools on its ports."""
 
+    kind = "camera"
+
     def __init__(
         self,
         scene: Scene,

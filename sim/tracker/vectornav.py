@@ -63,6 +63,8 @@ class InertialFaults(WireFaults):
 class VectorNavSensor:
     """The sensor on `wire`, fixed to the body whose `pose` it feels; `seed` drives its noise."""
 
+    kind = "inertial"
+
     def __init__(self, pose: Pose, wire: DeviceEnd, loop: asyncio.AbstractEventLoop, seed: int = 0) -> None:
         self.faults = InertialFaults()
         self.errors = InertialErrors()

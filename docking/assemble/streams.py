@@ -1,0 +1,80 @@
+"""The sensors that stream beside the tracker: a camera and an inertial sensor, real or simulated."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+from docking.assemble.simulated import FarEnd
+from docking.config import CellFile, JobFile
+from docking.config.instruments import NdiConfig
+from docking.errors import BadArgument, FileUnreadable
+from docking.ports import InertialSensor, PointStream, SerialLink, SpeedLink
+from drivers.links.serial_port import SerialPort
+from drivers.ndi_line import DEFAULT_BAUD
+from drivers.ndi_stream import NdiStream
+from drivers.vectornav import VectorNav
+from sim.tracker.ndi import NdiCamera
+from sim.tracker.plant_scene import PlantScene, component_pose
+from sim.tracker.vectornav import VectorNavSensor
+from sim.wires.pacing import DeviceEnd, SpeedEnd
+
+CAMERA, INERTIAL = "camera", "inertial sensor"
+PLUGGED = "component"
+"""The simulated camera has this tool on its port when none is configured."""
+
+
+def camera_of(cell: CellFile, folder: Path, link: SpeedLink | None = None) -> PointStream:
+    """The camera of the cell file, on its port or on `link`; tool definitions are sought from `folder`.
+
+    Raises BadArgument where the cell has none, FileUnreadable for a definition that cannot be read.
+    """
+    config = _camera(cell)
+    port = link if link is not None else SerialPort(config.port, DEFAULT_BAUD, CAMERA)
+    return NdiStream(port, config, _definitions(config, folder), CAMERA)
+
+
+def inertial_of(cell: CellFile, link: SerialLink | None = None) -> InertialSensor:
+    """The inertial sensor of the cell file, on its port or on `link`. Raises BadArgument where the cell has none."""
+    if cell.inertial is None:
+        raise BadArgument(INERTIAL, "the cell has no inertial sensor")
+    config = cell.inertial
+    return VectorNav(link if link is not None else SerialPort(config.port, config.baud, INERTIAL), config, INERTIAL)
+
+
+def simulated_camera(cell: CellFile, job: JobFile, folder: Path, far: FarEnd, wire: SpeedEnd) -> NdiCamera:
+    """A camera before the plant of `far`: all its tools ride on the component."""
+    config = _camera(cell)
+    roms = {rom: name for name, rom in _definitions(config, folder).items()}
+    plugged = () if roms else (PLUGGED,)
+    markers = tuple(target.name for target in job.component.targets)
+    scene = PlantScene(far.plant, config.station_pose, (*roms.values(), *plugged), markers)
+    camera = NdiCamera(scene, wire, far.loop, roms, plugged, far.seed)
+    camera.rate_hz = config.rate_hz
+    far.devices.append(camera)
+    return camera
+
+
+def simulated_inertial(far: FarEnd, wire: DeviceEnd) -> VectorNavSensor:
+    """An inertial sensor on the component of `far`."""
+    sensor = VectorNavSensor(partial(component_pose, far.plant), wire, far.loop, far.seed)
+    far.devices.append(sensor)
+    return sensor
+
+
+def _camera(cell: CellFile) -> NdiConfig:
+    if cell.camera is None:
+        raise BadArgument(CAMERA, "the cell has no camera")
+    return cell.camera
+
+
+def _definitions(config: NdiConfig, folder: Path) -> dict[str, bytes]:
+    """Definition of each configured tool, without the zeros that fill its last block."""
+    found = {}
+    for tool in config.tools:
+        path = folder / tool.rom
+        try:
+            found[tool.name] = path.read_bytes().rstrip(b"\0")
+        except OSError as error:
+            raise FileUnreadable(str(path), error.strerror or str(error)) from error
+    return found
