@@ -34,6 +34,7 @@ ONCE = (
     "disable_voltage",
     "refuse_write",
     "ignore_write",
+    "lie",
 )
 """Faults of a drive that nothing takes back."""
 

@@ -57,6 +57,26 @@ class TrackerConfig(Model):
     geocom: GeocomConfig | None = Field(default=None, description="settings of a GeoCOM instrument")
 
 
+Word32 = Annotated[int, Field(ge=0, le=0xFFFF_FFFF)]
+Turns = Annotated[int, Field(ge=1, le=0xFFFF_FFFF)]
+
+
+class DriveIdentity(Model):
+    vendor: Word32 | None = Field(default=None, description="1018h:01 of every drive; any when left out")
+    product: Word32 | None = Field(default=None, description="1018h:02 of every drive; any when left out")
+    revision: Word32 | None = Field(default=None, description="1018h:03 of every drive; any when left out")
+
+
+class DriveScale(Model):
+    encoder_increments: Turns = Field(description="increments of one motor revolution, 608Fh")
+    gear: tuple[Turns, Turns] = Field(
+        default=(1, 1), description="motor revolutions for so many revolutions of the screw, 6091h"
+    )
+    mm_per_revolution: Positive = Field(
+        description="travel of one revolution of the screw, mm; 6092h must state it in counts_per_mm"
+    )
+
+
 class CanBus(Model):
     kind: Literal["canopen"] = Field(description="twelve or fewer CiA 402 drives in cyclic synchronous position mode")
     interface: str = Field(description="python-can interface name, such as socketcan")
@@ -71,6 +91,12 @@ class CanBus(Model):
     )
     map: str = Field(default="cia402", description="object map in drivers/maps")
     counts_per_mm: Positive = Field(default=10000.0, description="position units of the drives in one mm")
+    identity: DriveIdentity = Field(
+        default=DriveIdentity(), description="vendor, product and revision that every drive must show (1018h)"
+    )
+    scale: DriveScale | None = Field(
+        default=None, description="encoder, gear and screw that every drive must state; not compared when left out"
+    )
     servo_lag_s: Annotated[float, Field(ge=0.0, le=0.1)] = Field(
         default=0.002, description="following error of a healthy axis, divided by its speed, s"
     )

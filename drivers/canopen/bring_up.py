@@ -6,10 +6,11 @@ import asyncio
 from collections.abc import Callable
 
 from docking.config.cell import CanBus, LimitsConfig
-from docking.errors import ConfigInvalid, DeviceRefused, ReadBackMismatch, WrongIdentity
+from docking.errors import ConfigInvalid, DeviceRefused, ReadBackMismatch
 from docking.ports import CanFrame
 from docking.types import Identity
 from drivers.canopen import codec
+from drivers.canopen.identity import DriveProof
 from drivers.canopen.nodes import AxisNode
 from drivers.canopen.sdo import SdoClient
 from drivers.maps.objects import ForceMode, ObjectEntry, ObjectMap, PdoEntry
@@ -61,9 +62,10 @@ def _force_quantities(node: AxisNode, mode: ForceMode) -> dict[str, int]:
 class NodeBringUp:
     """Prepares one pre-operational node. Every error names the axis."""
 
-    def __init__(self, node: AxisNode, omap: ObjectMap, send: Callable[[list[CanFrame]], None]) -> None:
+    def __init__(self, node: AxisNode, bus: CanBus, omap: ObjectMap, send: Callable[[list[CanFrame]], None]) -> None:
         self.node = node
         self.sdo = SdoClient(node.name, node.node, send, omap.abort_text)
+        self._proof = DriveProof(node, bus, omap, self.sdo)
         self._map = omap
         self._holds_force = node.force_n is not None
         self._mode = omap.force_mode.mode if self._holds_force else omap.mode
@@ -73,61 +75,20 @@ class NodeBringUp:
 
         Raises DeviceSilent, DeviceRefused, BadReply, WrongIdentity, ReadBackMismatch.
         """
-        identity = await self._identify()
+        identity = await self._proof.who()
+        await self._proof.scale()
         for name, value in self._map.written + (self._map.force_mode.written if self._holds_force else ()):
             number = given[value[1:]] if isinstance(value, str) else value
             await self._write(self._map.objects[name], number)
         await self._map_pdos()
         await self._set_mode()
-        self._refuse_twin()
+        self._proof.refuse_twin()
         return identity
 
     async def standing(self) -> tuple[int, int]:
         """Statusword and position (counts) as they are before the first read-back frame."""
         objects = self._map.objects
         return await self.sdo.read(objects["statusword"]), await self.sdo.read(objects["position"])
-
-    async def _identify(self) -> Identity:
-        objects, read = self._map.objects, self.sdo.read
-        profile = await read(objects["device_type"]) & 0xFFFF
-        self._expect("device profile", profile, self._map.device_profile)
-        found = {name: await read(objects[name]) for name in ("vendor", "product", "revision", "serial")}
-        self._refuse_twin()
-        for name, value in self._map.identity.items():
-            self._expect(name, found[name], value)
-        if self.node.axis.serial_number is not None:
-            self._expect("serial number", found["serial"], self.node.axis.serial_number)
-        await self._identify_mode()
-        name_text = await self._text("device_name")
-        version = await self._text("software_version")
-        product = f"{name_text} {found['product']:08X}h".strip()
-        firmware = f"{version} revision {found['revision']:08X}h".strip()
-        return Identity(self.node.name, f"{found['vendor']:08X}h", product, str(found["serial"]), firmware)
-
-    async def _identify_mode(self) -> None:
-        """The drive must have the mode, and for a held force the rated torque that its unit rests on."""
-        objects, force_mode = self._map.objects, self._map.force_mode
-        modes = await self.sdo.read(objects["supported_modes"])
-        bit = force_mode.supported_mode_bit if self._holds_force else self._map.supported_mode_bit
-        if not modes >> bit & 1:
-            cause = f"the drive has no cyclic synchronous {'torque' if self._holds_force else 'position'} mode"
-            raise WrongIdentity(self.node.name, cause, value=f"6502h = {modes:08X}h", limit=f"mode {self._mode}")
-        if self._holds_force:
-            self._expect("rated torque", await self.sdo.read(objects["rated_torque"]), force_mode.rated_torque_mnm)
-
-    def _refuse_twin(self) -> None:
-        if self.sdo.stray:
-            cause = f"{self.sdo.stray} answers too many: two devices use node number {self.node.node}"
-            raise WrongIdentity(self.node.name, cause, value="two devices", limit="one device")
-
-    async def _text(self, name: str) -> str:
-        data = await self.sdo.read_bytes(self._map.objects[name])
-        return data.rstrip(b"\x00").decode("ascii", "replace")
-
-    def _expect(self, what: str, value: int, wanted: int) -> None:
-        if value != wanted:
-            cause = f"{what} of node {self.node.node}"
-            raise WrongIdentity(self.node.name, cause, value=f"{what} {value}", limit=f"{what} {wanted}")
 
     async def _write(self, entry: ObjectEntry, value: int) -> None:
         await self.sdo.write(entry, value)

@@ -45,7 +45,7 @@ class CanopenPositioners:
         self._image = CyclicImage(self._nodes, self._map, self._bus.counts_per_mm, self._bus.cycle_s)
         self._watch = NodeWatch(self._nodes, self._map, self._bus.heartbeat_s)
         self._power = PowerGroup(self._image, self._step, self._cause_of)
-        self._setups = tuple(NodeBringUp(node, self._map, link.send) for node in self._nodes)
+        self._setups = tuple(NodeBringUp(node, self._bus, self._map, link.send) for node in self._nodes)
         ramp = self._map.objects["quick_stop_deceleration"]
         self._ramps = QuickStopRamps(self._setups, ramp, self.a_quick_mm_s2, self._bus.counts_per_mm)
         self._heartbeat = codec.heartbeat(self._map.host_node)

@@ -64,7 +64,8 @@ class ForceMode:
 
 @dataclass(frozen=True)
 class ObjectMap:
-    """A whole object map; `written` holds constants or `@quantity` texts in the order of writing."""
+    """A whole object map; `written` holds constants or `@quantity` texts in the order of writing, `proved` what must
+    be read without having been written."""
 
     name: str
     device_profile: int
@@ -72,6 +73,7 @@ class ObjectMap:
     mode: int
     host_node: int
     identity: dict[str, int]
+    proved: dict[str, int]
     objects: dict[str, ObjectEntry]
     written: tuple[tuple[str, int | str], ...]
     following_window_factor: float
@@ -113,7 +115,7 @@ def parse_object_map(raw: dict[str, Any]) -> ObjectMap:
     objects = {name: ObjectEntry(name, **entry) for name, entry in raw["objects"].items()}
     force_mode = dict(raw["force_mode"])
     force_written: dict[str, int | str] = force_mode.pop("written")
-    unknown = [name for name in (*raw["written"], *force_written) if name not in objects]
+    unknown = [name for name in (*raw["written"], *raw["proved"], *force_written) if name not in objects]
     if unknown or any(entry.type not in _BITS for entry in objects.values()):
         raise KeyError(f"unknown object or type {unknown}")
     return ObjectMap(
@@ -123,6 +125,7 @@ def parse_object_map(raw: dict[str, Any]) -> ObjectMap:
         mode=raw["mode"],
         host_node=raw["host_node"],
         identity=dict(raw["identity"]),
+        proved=dict(raw["proved"]),
         objects=objects,
         written=tuple(raw["written"].items()),
         following_window_factor=float(raw["margins"]["following_window"]),

@@ -52,6 +52,8 @@ class ObjectAccess:
             return round(float(self._plant.following_error_mm()[index]) * self._counts_per_mm)
         if obj == 0x603F:
             return drives.error_codes[index]
+        if obj == 0x6092 and sub == 1:
+            return round(MM_PER_REVOLUTION * self._counts_per_mm)
         if obj == 0x2100 and sub == 1:
             return round(float(np.nan_to_num(self._plant.force_n()[index])) / NEWTON_PER_COUNT)
         return None

@@ -43,6 +43,7 @@ RATED_TORQUE_MNM: Final = 32_000
 NEWTON_PER_PER_MILLE: Final = 20.0
 """Force at the ball of one thousandth of the rated torque, through gear and screw: 20 kN at 32 Nm."""
 MM_PER_REVOLUTION: Final = 10.0
+ENCODER_INCREMENTS: Final = 131_072
 
 READ_ONLY: Final = 0x0601_0002
 NO_OBJECT: Final = 0x0602_0000
@@ -77,7 +78,8 @@ class Entry:
 class Dictionary:
     """Objects of one node. `live(index, sub)` answers for values that change by themselves, None for the rest;
     `changed(index, sub, value)` hears of every write after it was stored; `operational()` guards the PDO set-up.
-    Faults: writes to `refused` objects are aborted with their code, writes to `deaf` ones change nothing."""
+    Faults: writes to `refused` objects are aborted with their code, writes to `deaf` ones change nothing; reads of
+    those in `lies` bring that value whatever is stored."""
 
     def __init__(
         self,
@@ -90,6 +92,7 @@ class Dictionary:
         self.node = node
         self.refused: dict[tuple[int, int], int] = {}
         self.deaf: set[tuple[int, int]] = set()
+        self.lies: dict[tuple[int, int], int] = {}
         self._live, self._changed, self._operational = live, changed, operational
         self._entries: dict[tuple[int, int], Entry] = {**_identity(node, settings), **_drive(), **_pdos(node)}
 
@@ -108,7 +111,8 @@ class Dictionary:
         entry = self._find(index, sub)
         if isinstance(entry.value, bytes):
             return entry.value
-        return struct.pack("<" + entry.kind, self.number(index, sub))
+        lie = self.lies.get((index, sub))
+        return struct.pack("<" + entry.kind, self.number(index, sub) if lie is None else lie)
 
     def write(self, index: int, sub: int, data: bytes) -> None:
         """Store what a master sends. Raises Abort."""
@@ -214,8 +218,18 @@ def _drive() -> dict[tuple[int, int], Entry]:
         (0x607D, 0): Entry("B", 2),
         (0x607D, 1): Entry("i", -0x8000_0000, True),
         (0x607D, 2): Entry("i", 0x7FFF_FFFF, True),
+        (0x607E, 0): Entry("B", 0),
         (0x6080, 0): Entry("I", 6000, True),
         (0x6085, 0): Entry("I", 1_000_000, True, 1),
+        (0x608F, 0): Entry("B", 2),
+        (0x608F, 1): Entry("I", ENCODER_INCREMENTS),
+        (0x608F, 2): Entry("I", 1),
+        (0x6091, 0): Entry("B", 2),
+        (0x6091, 1): Entry("I", 1),
+        (0x6091, 2): Entry("I", 1),
+        (0x6092, 0): Entry("B", 2),
+        (0x6092, 1): Entry("I", 0),
+        (0x6092, 2): Entry("I", 1),
         (0x60C2, 0): Entry("B", 2),
         (0x60C2, 1): Entry("B", 20, True, 1),
         (0x60C2, 2): Entry("b", -3, True, -6, 0),

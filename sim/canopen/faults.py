@@ -114,5 +114,9 @@ class DriveFaults:
         """The drive accepts every write of one object and keeps its value: the read-back differs."""
         self._group.nodes[self._axes.index(axis)].dictionary.deaf.add((obj, sub))
 
+    def lie(self, axis: str, obj: int, value: int, sub: int = 0) -> None:
+        """The drive answers reads of one object with this value, whatever it holds."""
+        self._group.nodes[self._axes.index(axis)].dictionary.lies[obj, sub] = value
+
     def _number(self, axis: str) -> int:
         return self._group.nodes[self._axes.index(axis)].number

@@ -7,7 +7,6 @@ import asyncio
 import numpy as np
 import pytest
 
-from docking.config import CellFile
 from docking.errors import (
     AxisNotEnabled,
     ConsistencyTrip,
@@ -252,21 +251,6 @@ def refused(scene: Scene, before) -> tuple[ReadyCell, DockingError]:
     return cell, error
 
 
-def with_serial_numbers(cell: CellFile) -> CellFile:
-    """Every drive must show the serial number that was noted at commissioning."""
-    stations = tuple(
-        station.model_copy(
-            update={
-                "axes": tuple(
-                    axis.model_copy(update={"serial_number": 402_000 + (axis.node or 0)}) for axis in station.axes
-                )
-            }
-        )
-        for station in cell.positioners
-    )
-    return cell.model_copy(update={"positioners": stations})
-
-
 def test_can_06_a_node_that_never_sent_a_heartbeat_is_not_enabled():
     _, error = refused(Scene(), lambda cell: cell.faults.lose_heartbeat("B.Y"))
     assert isinstance(error, DeviceSilent)
@@ -274,10 +258,20 @@ def test_can_06_a_node_that_never_sent_a_heartbeat_is_not_enabled():
 
 
 def test_can_08_two_drives_in_each_others_place_are_not_enabled():
-    scene = Scene(cell_changes=with_serial_numbers)
-    _, error = refused(scene, lambda cell: cell.faults.swap("A.X", "B.X"))
+    _, error = refused(Scene(), lambda cell: cell.faults.swap("A.X", "B.X"))
     assert isinstance(error, WrongIdentity)
     assert "A.X" in str(error)
+    assert "1018h:04 serial" in str(error)
+
+
+@pytest.mark.parametrize(
+    ("sub", "name", "value"), [(1, "vendor", 0x5D1), (2, "product", 0x0402_0009), (3, "revision", 0x0001_0004)]
+)
+def test_can_08_a_drive_of_another_kind_is_not_enabled(sub, name, value):
+    _, error = refused(Scene(), lambda cell: cell.faults.lie("D.Y", 0x1018, value, sub))
+    assert isinstance(error, WrongIdentity)
+    assert "D.Y" in str(error)
+    assert f"1018h:{sub:02d} {name}" in str(error)
 
 
 def test_can_08_two_devices_with_one_number_are_not_enabled():

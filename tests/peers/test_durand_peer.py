@@ -14,7 +14,7 @@ import pytest
 from docking.types import AxisState, Feedback
 from drivers.canopen.positioners import CanopenPositioners
 from drivers.links.can_bus import CanBusLink
-from tests.support.can_bench import can_cell, exchange
+from tests.support.can_bench import can_cell, exchange, foreign_drives
 
 durand = pytest.importorskip("durand")
 pytestmark = [pytest.mark.peer, pytest.mark.wires]
@@ -63,7 +63,8 @@ class PeerDrive:
         (0x1006, "UNSIGNED32"), (0x6007, "INTEGER16"), (0x6040, "UNSIGNED16"), (0x6041, "UNSIGNED16"),
         (0x605A, "INTEGER16"), (0x605D, "INTEGER16"), (0x605E, "INTEGER16"), (0x6060, "INTEGER8"),
         (0x6061, "INTEGER8"), (0x6064, "INTEGER32"), (0x6065, "UNSIGNED32"), (0x6066, "UNSIGNED16"),
-        (0x607A, "INTEGER32"), (0x6085, "UNSIGNED32"), (0x60F4, "INTEGER16"), (0x6502, "UNSIGNED32"),
+        (0x607A, "INTEGER32"), (0x607E, "UNSIGNED8"), (0x6085, "UNSIGNED32"), (0x60F4, "INTEGER16"),
+        (0x6502, "UNSIGNED32"),
     )  # fmt: skip
     NEXT: ClassVar = {
         (0x40, 0x06): 0x21, (0x21, 0x07): 0x23, (0x23, 0x0F): 0x27, (0x27, 0x07): 0x23, (0x23, 0x06): 0x21,
@@ -111,7 +112,7 @@ class PeerDrive:
 
 async def follow(link: CanBusLink, cycles: int) -> tuple[list[Feedback], list[np.ndarray], list[str]]:
     loop = asyncio.get_running_loop()
-    master = CanopenPositioners(can_cell("lab-can"), link)
+    master = CanopenPositioners(foreign_drives(can_cell("lab-can")), link)
     identities = await master.bring_up()
     q = (await master.enable()).position_mm
     path = [q + 0.02 * k * np.linspace(-1.0, 1.0, len(q)) for k in range(cycles)]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from docking.config.cell import CellFile
+from docking.config.cell import CellFile, DriveIdentity
 from docking.config.load import load_cell
 from docking.types import Array, Feedback
 from drivers.canopen.positioners import CanopenPositioners
@@ -64,6 +64,16 @@ def can_cell(name: str = "fuselage-can", **changes: object) -> CellFile:
     """A reference cell, with values of its bus changed."""
     cell = load_cell(CELLS / f"{name}.toml")
     return cell.model_copy(update={"bus": cell.bus.model_copy(update=changes)})
+
+
+def foreign_drives(cell: CellFile) -> CellFile:
+    """The cell with drives of any maker: no identity, no scale and no serial numbers are stated."""
+    bus = cell.bus.model_copy(update={"identity": DriveIdentity(), "scale": None})
+    stations = []
+    for station in cell.positioners:
+        axes = tuple(axis.model_copy(update={"serial_number": None}) for axis in station.axes)
+        stations.append(station.model_copy(update={"axes": axes}))
+    return cell.model_copy(update={"bus": bus, "positioners": tuple(stations)})
 
 
 def exchange(master: CanopenPositioners, setpoint_mm: Array) -> Feedback:
