@@ -49,8 +49,14 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[report]'
 	@touch $@
 
-$(VENV)/.installed-dev: $(VENV)/.installed
+NODE_PEER := tests/peers/programs/modbus_serial
+
+# The one peer from npm lies beside the packages, installed by the node of a wheel as its lock file says.
+$(VENV)/.installed-dev: $(VENV)/.installed $(NODE_PEER)/package-lock.json
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@mkdir -p $(VENV)/modbus_serial
+	cp $(NODE_PEER)/package.json $(NODE_PEER)/package-lock.json $(VENV)/modbus_serial
+	$(BIN)/python -m tests.peers.programs.install_modbus_serial $(VENV)/modbus_serial
 	@touch $@
 
 clean:

@@ -13,11 +13,13 @@ import numpy as np
 
 from docking.config.cell import CellFile
 from sim.plc.drives import FailedDrives
+from sim.plc.modbus_rtu import ModbusRtuLine
 from sim.plc.modbus_tcp import ModbusTcpConnection
 from sim.plc.playback import Point
 from sim.plc.positioner import SCAN_S, Lines, PositionerPlc
 from sim.plc.registers import AXES, State
 from sim.plc.sensors import PlantView, Readings, Sensors
+from sim.wires.pacing import DeviceEnd
 
 Address = tuple[str, int]
 FOLLOWING_ERROR_FACTOR = 2.0
@@ -87,6 +89,13 @@ class PlcGroup:
         self._due_s = self._before_s = self._loop.time()
         self._schedule()
         return result
+
+    def serve_line(self, end: DeviceEnd, baud: int) -> ModbusRtuLine:
+        """Start scanning and answer for all positioners at the end of one serial line, each by its unit."""
+        units = {p.unit or 1: plc for p, plc in zip(self._cell.positioners, self.plcs, strict=True)}
+        self._due_s = self._before_s = self._loop.time()
+        self._schedule()
+        return ModbusRtuLine(units, end, baud, self._loop)
 
     async def _listen(self, address: Address, units: Mapping[int, PositionerPlc]) -> asyncio.Server:
         server = await self._loop.create_server(lambda: ModbusTcpConnection(units, self._connections), *address)

@@ -16,25 +16,13 @@ import pytest
 from docking.errors import BadReply, DeviceRefused, DeviceSilent, PortMissing
 from drivers.modbus_client import ModbusUnit
 from drivers.modbus_positioners import ModbusPositioners
-from sim.plc.group import PlcGroup
-from tests.support.modbus_cell import START_MM, StiffPlant, cell, plan
+from tests.support.modbus_cell import START_MM, cell, plan
+from tests.support.real_plcs import simulated_plcs
 
 SETTINGS = ("300", "500", "12", "25", "1500")
 """watchdog_ms, ramp_ms, min_fill, stuck_um, servo_lag_us."""
 
 pytestmark = [pytest.mark.peer, pytest.mark.wires]
-
-
-@asynccontextmanager
-async def simulated_plcs() -> AsyncIterator[tuple[StiffPlant, dict[str, tuple[str, int]]]]:
-    """Four PLCs on free loopback ports in real time."""
-    plant = StiffPlant()
-    group = PlcGroup(plant, cell(), (0.0,) * 4, asyncio.get_running_loop())
-    addresses = await group.serve(dict.fromkeys("ABCD", ("127.0.0.1", 0)))
-    try:
-        yield plant, addresses
-    finally:
-        await group.close()
 
 
 def _with_modbus_tk(port: int) -> dict[str, Any]:
