@@ -13,6 +13,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--all-cells", action="store_true", help="dock the full-size cells over real wires too, in real time"
     )
+    parser.addoption(
+        "--hardware", metavar="CELL", help="a cell file: the tests marked hardware run on its real devices"
+    )
     parser.addoption("--full", action="store_true", help="the full sets of cases that are marked so, not only a few")
 
 
@@ -50,13 +53,13 @@ def pytest_configure(config: pytest.Config) -> None:
     """Begin without an event loop: pytest-asyncio would make one to restore, never close it, and warn of it."""
     asyncio.set_event_loop(None)
     config.addinivalue_line("markers", "full: a case of a full set, run with --full only")
+    config.addinivalue_line("markers", "hardware: runs on the real devices of --hardware CELL only")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave the cases marked `full` out unless they are asked for."""
-    if config.getoption("--full"):
-        return
-    left_out = [item for item in items if item.get_closest_marker("full")]
+    """Leave the cases marked `full` or `hardware` out unless they are asked for."""
+    unasked = [marker for marker in ("full", "hardware") if not config.getoption(f"--{marker}")]
+    left_out = [item for item in items if any(item.get_closest_marker(marker) for marker in unasked)]
     if left_out:
         config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if not item.get_closest_marker("full")]
+        items[:] = [item for item in items if item not in left_out]

@@ -68,7 +68,7 @@ def build_cell(
     if motion is None:
         motion = motion_beside(cell, local_motion(cell, job, wires.can, wires.modbus))
     survey = Survey(
-        tracker=_tracker(cell, wires.serial),
+        tracker=tracker_of(cell, wires.serial),
         journal=company.journal,
         nominals=_nominals(cell, job),
         settings=_survey_settings(cell, job),
@@ -82,7 +82,8 @@ def build_cell(
     return Cell(Procedure(settings, approach, survey, motion, company.journal, company.operator))
 
 
-def _tracker(cell: CellFile, link: SerialLink) -> Tracker:
+def tracker_of(cell: CellFile, link: SerialLink) -> Tracker:
+    """The tracker of the cell file on `link`, with the noise of its class."""
     noise = noise_of(cell)
 
     def covariance(p_T_mm: Array) -> Array:

@@ -24,7 +24,8 @@ SIGMA_MM = 0.05
 PROTOCOLS = ("line", "geocom", "geocom-crc")
 
 
-def _config(protocol: str, timeout_s: float) -> TrackerConfig:
+def bench_config(protocol: str, timeout_s: float) -> TrackerConfig:
+    """Settings of a two-faced tracker of this protocol."""
     ers = tuple(ErsPoint(name=f"E{i}", xyz_mm=(float(i), 0.0, 0.0), sigma_mm=0.01) for i in range(4))
     return TrackerConfig(
         protocol="line" if protocol == "line" else "geocom",
@@ -48,7 +49,7 @@ class TrackerBench:
         self.optics = FakeOptics(measure_s=measure_s, noise_mm=0.0)
         driver, device = (LineTracker, LineTrackerDevice) if protocol == "line" else (GeocomTracker, GeocomStation)
         self.device: Any = device(self.optics, self.wire.far, self.loop)
-        self.tracker: Any = driver(self.wire.near, _config(protocol, timeout_s), self._covariance)
+        self.tracker: Any = driver(self.wire.near, bench_config(protocol, timeout_s), self._covariance)
 
     @staticmethod
     def _covariance(p_T_mm: Array) -> Array:
