@@ -104,8 +104,8 @@ class NdiLine:
             except (DeviceSilent, DeviceRefused, BadReply):
                 continue
             return speed
-        tried = f"{baud} nor at {DEFAULT_BAUD} bit/s; {self.bad_lines} bad replies"
-        raise DeviceSilent(self._name, f"no answer neither at {tried}", limit=RESET_TIMEOUT_S)
+        tried = f"neither at {baud} nor at {DEFAULT_BAUD} bit/s; {self.bad_lines} bad replies"
+        raise DeviceSilent(self._name, f"it answers {tried}", limit=RESET_TIMEOUT_S)
 
     async def _exchange(self, command: bytes, name: str, timeout_s: float) -> str:
         if self._lost is not None:
