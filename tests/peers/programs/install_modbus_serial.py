@@ -1,4 +1,4 @@
-"""`python -m tests.peers.programs.install_modbus_serial FOLDER`: npm of a wheel installs what the lock file in it says."""
+"""`python -m tests.peers.programs.install_modbus_serial FOLDER`: the npm of a wheel installs by the lock file in it."""
 
 from __future__ import annotations
 
