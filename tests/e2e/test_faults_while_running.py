@@ -118,6 +118,12 @@ def test_a_jammed_axis_stops_all_on_the_path(name, share, axis, tmp_path):
     moved = run.records("moved")[0]
     assert moved["result"] == "fault"
     assert 0.0 < moved["path_time_s"] < plan.duration_s
+    # I9: when it was found, when the commands changed for it, when all stood.
+    stop, begun_s = alarm["stop"], next(r["t_mono_s"] for r in run.all_records() if r["kind"] == "intent")
+    assert stop == moved["stop"]
+    assert begun_s + share * plan.duration_s <= stop["found_s"] < alarm["t_s"]
+    assert 0.0 <= stop["commanded_after_s"] <= (0.01 if run.bus is not None else 0.1)
+    assert stop["commanded_after_s"] < stop["rest_after_s"] <= alarm["t_s"] - stop["found_s"] + 1e-9
     others = np.array([axis != jammed[0] for axis in plan.axes])
     if run.bus is not None:
         times, table = run.setpoints_mm()
