@@ -97,6 +97,6 @@ class DriveProof:
             cause = f"object {label} of node {self._node.node}"
             raise WrongIdentity(self._node.name, cause, value=f"{what} {value}", limit=f"{what} {wanted}")
 
-    def _mismatch(self, name: str, found: object, wanted: object) -> ReadBackMismatch:
+    def _mismatch(self, name: str, found: float | str, wanted: float | str) -> ReadBackMismatch:
         cause = f"object {self._map.objects[name].label}"
         return ReadBackMismatch(self._node.name, cause, value=found, limit=wanted)
