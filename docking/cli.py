@@ -8,6 +8,7 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from docking.errors import (
     DockingError,
     StoppedByOperator,
 )
-from docking.terminal import FILE, json_option, language, print_json, print_text
+from docking.terminal import FILE, json_option, language, print_json, print_text, transcript_option
 from docking.words import tell
 
 EXIT_OF_OUTCOME = {
@@ -144,8 +145,9 @@ def dry_run(cell: Path, job: Path | None, seed: int, as_json: bool, **files: Pat
 @click.option(
     "--journal", type=FILE, help="Keep the journal in this file (default: beside the report, else temporary)."
 )
+@transcript_option
 @json_option
-def run(as_json: bool, step: bool, sim: bool, wires: Path | None, **request: Any) -> int:
+def run(as_json: bool, step: bool, sim: bool, wires: Path | None, transcript: Path | None, **request: Any) -> int:
     """Dock over real wires, to real devices or (--sim) simulated ones.
 
     \b
@@ -160,6 +162,7 @@ def run(as_json: bool, step: bool, sim: bool, wires: Path | None, **request: Any
     wanted = assemble.RunRequest(
         request["cell"], request["job"], request["seed"], request["report"], request["journal"], language()
     )
+    wanted = replace(wanted, transcript=transcript)
     summary = assemble.run_on_wires(wanted, assemble.WireChoice(sim, wires), _say(as_json), step=step)
     return _ended(summary, as_json)
 
@@ -206,6 +209,7 @@ def relieve(as_json: bool, supervisor: str, after: Path | None, sim: bool, wires
 @click.option("--wires", type=FILE, help="Write the addresses of the wires to this JSON file.")
 @click.option("--trace", type=FILE, help="Record commanded and actual position of every axis in this CSV file, 100 Hz.")
 @click.option("--scenario", type=FILE, help="Let the faults in this TOML file happen, by time (at_s) only.")
+@transcript_option
 def sim(cell: Path, job: Path | None, seed: int, **files: Path | None) -> int:
     """Serve the simulated devices of a cell on real wires until interrupted.
 
@@ -214,7 +218,7 @@ def sim(cell: Path, job: Path | None, seed: int, **files: Path | None) -> int:
     """
     from docking import assemble
 
-    request = assemble.RunRequest(cell, job, seed, None, None, language(), files["scenario"])
+    request = assemble.RunRequest(cell, job, seed, None, None, language(), files["scenario"], files["transcript"])
     assemble.serve(request, files["wires"], _say(False), files["trace"])
     return EXIT_OK
 

@@ -173,7 +173,7 @@ class QueuedPositioners(Protocol):
 
 
 class Inputs(Protocol):
-    """Wired inputs beside the axes: contacts and temperatures. `on_change` is called when `latest` says something new."""
+    """Wired inputs beside the axes: contacts, temperatures. `on_change` is called when `latest` has something new."""
 
     on_change: Callable[[], None]
 

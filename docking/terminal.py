@@ -26,6 +26,12 @@ def json_option(command: Callable[..., Any]) -> Callable[..., Any]:
     )
 
 
+def transcript_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The option `--transcript` of a command."""
+    text = "Write all bytes of all wires with their times into this text file."
+    return click.option("--transcript", type=FILE, help=text)(command)
+
+
 def print_text(text: str, *, err: bool = False) -> None:
     """Print; a terminal that has gone away changes neither what the cell does nor the exit code."""
     with contextlib.suppress(OSError):

@@ -43,6 +43,18 @@ _WRITE = struct.Struct(">HHB")
 _EXCHANGE = struct.Struct(">HHHHB")
 
 
+Tap = Callable[[str, bool, bytes], None]
+"""Hears (name of the device, whether it was sent, bytes)."""
+
+
+def tapped(tap: Tap | None, name: str) -> Callable[[bool, bytes], None] | None:
+    """`tap` for the device `name`."""
+    if tap is None:
+        return None
+    hear = tap
+    return lambda sent, data: hear(name, sent, data)
+
+
 class _Request(ModbusPDU):
     """A request whose body is ready-made."""
 
@@ -60,12 +72,15 @@ class ModbusUnit:
 
     Every request ends within `timeout_s`: DeviceSilent for a read, OutcomeUnknown for anything that writes,
     DeviceRefused on an exception reply, BadReply on a reply that does not fit, LinkLost when the connection breaks.
-    `on_lost` is called when the connection breaks, whether a request waits or not.
+    `on_lost` is called when the connection breaks, whether a request waits or not; `tap(sent, data)`, where it is set,
+    hears all bytes.
     """
 
     def __init__(self, where: str, host: str, port: int, unit: int, timeout_s: float) -> None:
         self.where, self._unit, self._timeout_s = where, unit, timeout_s
         self.on_lost: Callable[[], None] = lambda: None
+        self.tap: Callable[[bool, bytes], None] | None = None
+        self._tapped = b""
         self._address = f"{host}:{port}"
         self._request: _Request | None = None
         self._reply: asyncio.Future[tuple[int, bytes]]
@@ -157,6 +172,8 @@ class ModbusUnit:
     def _inspect(self, sending: bool, data: bytes) -> bytes:
         """Let pymodbus send, and keep what comes from it: the answer of the request is taken once it is whole."""
         request = self._request
+        if self.tap is not None:
+            self._tell(sending, data)
         if sending or request is None:
             return data if sending else b""
         at = 0
@@ -177,6 +194,13 @@ class ModbusUnit:
                 self._skipped = end
             at = end
         return b""
+
+    def _tell(self, sent: bool, data: bytes) -> None:
+        """Received bytes come again together with those behind them, until a frame is whole."""
+        fresh = data[len(self._tapped) :] if not sent and data.startswith(self._tapped) else data
+        self._tapped = b"" if sent else data
+        if self.tap is not None and fresh:
+            self.tap(sent, fresh)
 
     def _complaint(self, request: _Request, unit: int, function: int, body: bytes) -> str:
         """Why the reply is of the wrong unit, function or length; empty when it fits."""

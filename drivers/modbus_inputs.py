@@ -11,7 +11,7 @@ from docking.errors import BadReply, DockingError, WrongIdentity
 from docking.types import Identity
 from drivers.inputs import SILENT_AFTER
 from drivers.maps.io_modules import load_modbus_io
-from drivers.modbus_client import ModbusUnit
+from drivers.modbus_client import ModbusUnit, Tap, tapped
 
 AGAIN_S = 1.0
 """Longest wait before a lost connection is tried again."""
@@ -23,13 +23,14 @@ class ModbusIoModule:
     A module that answers with the counter of the poll before is not fresh. A lost connection is tried again.
     """
 
-    def __init__(self, config: ModbusModule, address: tuple[str, int] | None = None) -> None:
+    def __init__(self, config: ModbusModule, address: tuple[str, int] | None = None, tap: Tap | None = None) -> None:
         self.name, self._config = config.name, config
         self.on_change: Callable[[], None] = lambda: None
         self._map = load_modbus_io(config.map)
         self.where = f"input module {config.name}"
         host, port = address or (config.host, config.port)
         self.unit = ModbusUnit(self.where, host, port, config.unit, config.timeout_s)
+        self.unit.tap = tapped(tap, config.name)
         self._levels = b""
         self._counts: tuple[int, ...] = ()
         self._alive: int | None = None

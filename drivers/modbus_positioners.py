@@ -22,6 +22,7 @@ from docking.errors import (
     SegmentRejected,
 )
 from docking.types import Array, AxisState, FaultKind, Feedback, Identity, Plan
+from drivers.modbus_client import Tap
 from drivers.path_clocks import PathClock, apart_s
 from drivers.positioner_plc import ENABLE_S, PositionerPlc, Segments
 from drivers.register_map import load_map
@@ -83,13 +84,15 @@ def _shown(plc: PositionerPlc) -> AxisState:
 class ModbusPositioners:
     """All positioners of a cell, one PLC each; construct and use it inside one running loop.
 
-    `addresses` overrides host and port of the cell file by positioner name.
+    `addresses` overrides host and port of the cell file by positioner name; `tap` hears all bytes.
     """
 
-    def __init__(self, cell: CellFile, addresses: Mapping[str, tuple[str, int]] | None = None) -> None:
+    def __init__(
+        self, cell: CellFile, addresses: Mapping[str, tuple[str, int]] | None = None, tap: Tap | None = None
+    ) -> None:
         if not isinstance(cell.bus, ModbusBus):
             raise BadArgument("bus", "this cell has no Modbus positioners", value=cell.bus.kind)
-        self._cell, self._bus = cell, cell.bus
+        self._cell, self._bus, self._tap = cell, cell.bus, tap
         self._driven = np.array(cell.driven)
         self._a_quick = np.array([axis.a_quick_mm_s2 for p in cell.positioners for axis in p.axes])
         self.axes = cell.axis_names
@@ -116,7 +119,7 @@ class ModbusPositioners:
     async def bring_up(self) -> tuple[Identity, ...]:
         """Connect to every PLC, prove identity, scan, settings and strokes; axes stay disabled."""
         self._plcs = tuple(
-            PositionerPlc(p, self._bus, self._map, self._addresses[p.name]) for p in self._cell.positioners
+            PositionerPlc(p, self._bus, self._map, self._addresses[p.name], self._tap) for p in self._cell.positioners
         )
         self._watches = tuple(_Watch(self._bus.scan_s) for _ in self._plcs)
         # Two controllers, or one and the host: each off by no more than the cell's clocks are.

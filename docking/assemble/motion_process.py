@@ -8,6 +8,7 @@ on the path and are braked.
 from __future__ import annotations
 
 import asyncio
+import atexit
 import os
 import signal
 import socket
@@ -26,19 +27,25 @@ from docking.motion.channel import Channel, SocketChannel
 from docking.motion.lateness import Lateness, measure_lateness
 from docking.motion.messages import WHERE, decode, encode
 from docking.motion.served import ServedMotion
+from docking.transcript import Transcript
 
 LOOKS_S = 0.002
 """Period at which lateness is measured where the bus has no cycle, and at most."""
 
 
 def run_motion(cell_file: Path, job_file: Path, found: dict[str, Any], channel: Channel) -> ServedMotion:
-    """Serve the axes of a cell on the running loop; `found` holds the addresses of simulated devices.
+    """Serve the axes of a cell on the running loop; `found` holds the addresses of simulated devices, and where the
+    transcript goes.
 
     Raises ConfigError.
     """
     cell = load_cell(cell_file)
     job = load_job(job_file, cell)
-    motion = local_motion(cell, job, *near_bus(cell, found))
+    transcript = None
+    if "transcript" in found:
+        transcript = Transcript(Path(found["transcript"]), asyncio.get_running_loop().time)
+        atexit.register(transcript.close)
+    motion = local_motion(cell, job, *near_bus(cell, found), transcript)
     return ServedMotion(motion, channel, service_settings(cell), lambda: _measure(cell))
 
 

@@ -16,42 +16,50 @@ from docking.motion.monitors import watch_from
 from docking.motion.remote import LeaseSettings, RemoteMotion
 from docking.motion.served import LocalMotion, ServedMotion, ServiceSettings
 from docking.ports import CanLink
+from docking.transcript import TranscribedCan, Transcript
 from drivers.canopen.io_module import CanIoModule
 from drivers.canopen.positioners import CanopenPositioners
 from drivers.canopen.shared import SharedCan
 from drivers.inputs import SILENT_AFTER, InputModule, WiredInputs
 from drivers.maps.objects import load_object_map
+from drivers.modbus_client import Tap
 from drivers.modbus_inputs import ModbusIoModule
 from drivers.modbus_positioners import ModbusPositioners
 
 
-def local_motion(cell: CellFile, job: JobFile, can: CanLink | None, modbus: Addresses | None) -> LocalMotion:
-    """What drives the axes and reads the inputs, in the process that calls."""
-    inputs = cell.inputs
+def local_motion(
+    cell: CellFile, job: JobFile, can: CanLink | None, modbus: Addresses | None, transcript: Transcript | None = None
+) -> LocalMotion:
+    """What drives the axes and reads the inputs, in the process that calls; `transcript` gets all bytes."""
+    inputs, tap = cell.inputs, transcript.modbus if transcript is not None else None
+    if transcript is not None and can is not None:
+        can = TranscribedCan(can, transcript)
     if inputs is None:
-        return _axes(cell, job, can, modbus)
+        return _axes(cell, job, can, modbus, tap)
     shared = SharedCan(can) if can is not None else None
-    motion = _axes(cell, job, shared.end() if shared is not None else None, modbus)
-    modules = input_modules(inputs, shared, modbus)
+    motion = _axes(cell, job, shared.end() if shared is not None else None, modbus, tap)
+    modules = input_modules(inputs, shared, modbus, tap)
     return GuardedMotion(motion, WiredInputs(inputs, modules), input_rules(inputs))
 
 
-def _axes(cell: CellFile, job: JobFile, can: CanLink | None, modbus: Addresses | None) -> LocalMotion:
+def _axes(cell: CellFile, job: JobFile, can: CanLink | None, modbus: Addresses | None, tap: Tap | None) -> LocalMotion:
     watch = watch_from(cell, job)
     if isinstance(cell.bus, ModbusBus):
-        return QueuedMotion(ModbusPositioners(cell, modbus), watch, cell.bus.poll_s)
+        return QueuedMotion(ModbusPositioners(cell, modbus, tap), watch, cell.bus.poll_s)
     if can is None:
         raise ValueError("a CANopen cell needs the near end of its bus")
     return StreamedMotion(CanopenPositioners(cell, can), watch, cell.limits.tick_late_cycles)
 
 
-def input_modules(inputs: InputsConfig, shared: SharedCan | None, modbus: Addresses | None) -> dict[str, InputModule]:
+def input_modules(
+    inputs: InputsConfig, shared: SharedCan | None, modbus: Addresses | None, tap: Tap | None = None
+) -> dict[str, InputModule]:
     """The drivers of the modules, by name; CANopen ones on the bus that `shared` deals out."""
     modules: dict[str, InputModule] = {}
     words = load_object_map("cia402").abort_text
     for module in inputs.modules:
         if isinstance(module, ModbusModule):
-            modules[module.name] = ModbusIoModule(module, (modbus or {}).get(module.name))
+            modules[module.name] = ModbusIoModule(module, (modbus or {}).get(module.name), tap)
         elif shared is not None:
             end = shared.end(CanIoModule.cobs(module))
             modules[module.name] = CanIoModule(module, end, words)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import json
 import os
@@ -16,6 +17,7 @@ from docking.config import CellFile, JobFile
 from docking.config.inputs import ModbusModule
 from docking.config.load import default_job_path, load_cell, load_job
 from docking.errors import BadArgument, FileUnreadable, FileUnwritable
+from docking.transcript import Transcript
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 Say = Callable[[str], None]
@@ -115,6 +117,16 @@ def _refuse_real_devices(path: Path, found: dict[str, Any]) -> None:
     far += [can] if can and not Path(can).is_socket() else []
     if far:
         raise BadArgument("--wires", f"{far[0]} is no simulated device of this machine", value=str(path))
+
+
+def opened(path: Path | None) -> Transcript | None:
+    """A fresh transcript in `path` on the time of the running loop. Raises FileUnwritable."""
+    if path is None:
+        return None
+    prepare(path)
+    with writing(path):
+        path.unlink(missing_ok=True)
+    return Transcript(path, asyncio.get_running_loop().time)
 
 
 def read_wires(path: Path, cell: CellFile) -> dict[str, Any]:

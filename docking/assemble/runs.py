@@ -12,7 +12,17 @@ from typing import Any
 
 from docking.assemble.controller import Company, Wires, build_cell
 from docking.assemble.real_time import aside, on_interrupt, run_real
-from docking.assemble.requests import Files, RunRequest, Say, WireChoice, journal_path, load_files, read_wires, writing
+from docking.assemble.requests import (
+    Files,
+    RunRequest,
+    Say,
+    WireChoice,
+    journal_path,
+    load_files,
+    opened,
+    read_wires,
+    writing,
+)
 from docking.assemble.scenarios import WatchedJournal, as_expected, event_facts, runner_of, scenario_of
 from docking.assemble.simulated import FarEnd, make_far_end, real_wires, truth_of, virtual_wires
 from docking.assemble.spawned import MotionProcess
@@ -20,11 +30,12 @@ from docking.cell import Cell
 from docking.config.load import file_sha256
 from docking.journal import JournalFile, read
 from docking.operators import AutomaticOperator, TerminalOperator
-from docking.ports import Journal, Motion, Operator, at_once
+from docking.ports import Journal, Motion, Operator, SerialLink, at_once
 from docking.procedure import Procedure
 from docking.progress import Progress
 from docking.records import alarm_record
 from docking.state import Event, State
+from docking.transcript import TranscribedSerial
 from docking.version import VERSION
 from drivers.links.serial_port import SerialPort
 from sim.scenario import EventModel, ScenarioFile
@@ -84,13 +95,19 @@ def run_on_wires(request: RunRequest, choice: WireChoice, say: Say, *, step: boo
             else:
                 found = read_wires(choice.wires, files.cell) if choice.wires else {}
             operator = (TerminalOperator if step else AutomaticOperator)(say, request.language)
-            wires = Wires(SerialPort(found.get("tracker", files.cell.tracker.port), files.cell.tracker.baud))
-            joined = _Joined(process, found)
+            serial: SerialLink = SerialPort(found.get("tracker", files.cell.tracker.port), files.cell.tracker.baud)
+            transcript = opened(request.transcript)
+            if transcript is not None:
+                serial = TranscribedSerial(serial, transcript, "tracker")
+                found = {**found, "transcript": str(transcript.path.resolve())}
+            wires, joined = Wires(serial), _Joined(process, found)
             try:
                 return await _dock(_Run(files, request, wires, operator, path, far, choice.sim, joined, step))
             finally:
                 if far is not None:
                     await far.close()
+                if transcript is not None:
+                    transcript.close()
 
         # Ticks are the motion process' business; here only those of simulated devices have to be on time.
         own_devices = choice.sim and choice.wires is None

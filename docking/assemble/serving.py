@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 
 from docking.assemble.real_time import on_interrupt, run_real
-from docking.assemble.requests import RunRequest, Say, load_files, prepare, writing
+from docking.assemble.requests import RunRequest, Say, load_files, opened, prepare, writing
 from docking.assemble.scenarios import runner_of, scenario_of
 from docking.assemble.simulated import make_far_end, real_wires, truth_of
 from docking.words import tell
@@ -26,7 +26,8 @@ def serve(request: RunRequest, wires_file: Path | None, say: Say, trace: Path | 
 
         async def main() -> None:
             far = make_far_end(files.cell, files.job, truth_of(request.cell_path), request.seed)
-            found = await real_wires(files.cell, far, Path(folder))
+            transcript = opened(request.transcript)
+            found = await real_wires(files.cell, far, Path(folder), transcript)
             if trace is not None:
                 with writing(trace):
                     far.trace(trace)
@@ -53,5 +54,7 @@ def serve(request: RunRequest, wires_file: Path | None, say: Say, trace: Path | 
                 await asked_to_end.wait()
             finally:
                 await far.close()
+                if transcript is not None:
+                    transcript.close()
 
         run_real(main)

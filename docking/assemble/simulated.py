@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 
 from docking.assemble.controller import Wires
+from docking.assemble.transcribed import TranscribedDevice, TranscribedStation
 from docking.config import CellFile, JobFile
 from docking.config.cell import CanBus, ModbusBus
 from docking.config.inputs import CanModule, ModbusModule
+from docking.transcript import Transcript
 from sim.canopen.group import DriveGroup
 from sim.canopen.io_module import IoModule
 from sim.canopen.settings import DriveSettings
@@ -59,6 +61,7 @@ class FarEnd:
     world: InputWorld
     devices: list[Any] = field(default_factory=list)
     line: VirtualSerial | None = None
+    transcript: Transcript | None = None
 
     def tracker(self, cell: CellFile, wire: DeviceEnd) -> None:
         """Put the instrument on a serial wire."""
@@ -92,6 +95,7 @@ class FarEnd:
         late_s = np.random.default_rng([self.seed, len(names)]).uniform(0.0, skew_s, len(names)).tolist()
         group = PlcGroup(self.plant, cell, [self.plant.clock_ppm[n] for n in names], self.loop, late_s)
         self.devices.append(group)
+        group.tap = self.transcript.modbus if self.transcript is not None else None
         return {**await group.serve(addresses), **await self.modbus_inputs(cell, LOCAL if addresses else None)}
 
     async def modbus_inputs(self, cell: CellFile, host: str | None = None) -> dict[str, tuple[str, int]]:
@@ -100,6 +104,7 @@ class FarEnd:
         found = {}
         for module in modules:
             server = IoServer(IoRegisters(module.name, self.world, self.loop.time), module.unit)
+            server.tap = self.transcript.modbus if self.transcript is not None else None
             self.devices.append(server)
             found[module.name] = await server.serve(*((host, 0) if host else (module.host, module.port)))
         return found
@@ -139,11 +144,12 @@ async def virtual_wires(cell: CellFile, far: FarEnd) -> Wires:
     return Wires(serial.near, modbus=await far.plcs(cell, None))
 
 
-async def real_wires(cell: CellFile, far: FarEnd, folder: Path) -> dict[str, Any]:
+async def real_wires(cell: CellFile, far: FarEnd, folder: Path, transcript: Transcript | None = None) -> dict[str, Any]:
     """All devices on real wires (pty, AF_UNIX CAN, loopback TCP); returns their addresses as plain data."""
     serial = PtySerial(far.loop, cell.tracker.baud)
     serial.open()
-    far.tracker(cell, serial)
+    far.transcript = transcript
+    far.tracker(cell, TranscribedDevice(serial, transcript, "tracker") if transcript is not None else serial)
     far.devices.append(serial)
     found: dict[str, Any] = {"cell": cell.name, "tracker": serial.path}
     if isinstance(cell.bus, ModbusBus):
@@ -152,7 +158,7 @@ async def real_wires(cell: CellFile, far: FarEnd, folder: Path) -> dict[str, Any
         return found
     bus = UnixCanServer(folder / "can.sock")
     await bus.open()
-    far.drives(cell, bus, shared_cpu=True)
+    far.drives(cell, TranscribedStation(bus, transcript) if transcript is not None else bus, shared_cpu=True)
     far.devices.append(bus)
     found["can"] = str(bus.path)
     beside = {name: list(at) for name, at in (await far.modbus_inputs(cell, LOCAL)).items()}

@@ -137,26 +137,19 @@ class GuardedMotion:
 
     def _findings(self, state: InputState) -> Iterator[tuple[str, Finding]]:
         """(name, finding) of every input that is not as it should be, the most severe first."""
-        rules, given = self._rules, state.given
-        for name in rules.emergency:
-            if given.get(name):
-                yield name, Finding(Trigger.EMERGENCY_STOP, EmergencyStop(name))
-        for name in rules.protective:
-            if given.get(name):
-                yield name, Finding(Trigger.PROTECTIVE_STOP, ProtectiveStop(name))
-        for module in state.silent:
-            yield module, Finding(Trigger.INPUTS_SILENT, self._silent(module))
-        for name, axis in rules.limits.items():
-            if given.get(name):
-                yield name, Finding(Trigger.LIMIT_SWITCH, AxisAtLimit(axis, f"input {name}"))
+        rules, stage = self._rules, self._stage
+        on = [name for name, given in state.given.items() if given]
+        off = [name for name, given in state.given.items() if given is False]
+        yield from ((n, Finding(Trigger.EMERGENCY_STOP, EmergencyStop(n))) for n in rules.emergency if n in on)
+        yield from ((n, Finding(Trigger.PROTECTIVE_STOP, ProtectiveStop(n))) for n in rules.protective if n in on)
+        yield from ((module, Finding(Trigger.INPUTS_SILENT, self._silent(module))) for module in state.silent)
+        pressed = ((n, axis) for n, axis in rules.limits.items() if n in on)
+        yield from ((n, Finding(Trigger.LIMIT_SWITCH, AxisAtLimit(axis, f"input {n}"))) for n, axis in pressed)
         moving = self._motion.arbiter.mode is Mode.MOVING
-        for name, axis in rules.brakes.items() if moving else ():
-            if given.get(name):
-                error = BrakeDisagrees(axis, f"input {name}", value="closed", limit="open")
-                yield name, Finding(Trigger.BRAKE, error)
-        for name in self._requires:
-            if given.get(name) is False:
-                yield name, Finding(Trigger.PERMISSIVE_LOST, PermissiveLost(name, value=self._stage))
+        closed = ((n, axis) for n, axis in rules.brakes.items() if moving and n in on)
+        yield from ((n, Finding(Trigger.BRAKE, _closed_in_motion(n, axis))) for n, axis in closed)
+        fallen = (n for n in self._requires if n in off)
+        yield from ((n, Finding(Trigger.PERMISSIVE_LOST, PermissiveLost(n, value=stage))) for n in fallen)
 
     def _stop(self) -> DockingError | None:
         """What forbids that anything begins."""
@@ -177,6 +170,10 @@ class GuardedMotion:
         error = self._stop()
         if error is not None:
             raise error
+
+
+def _closed_in_motion(name: str, axis: str) -> BrakeDisagrees:
+    return BrakeDisagrees(axis, f"input {name}", value="closed", limit="open")
 
 
 def _closed(given: bool | None) -> str:

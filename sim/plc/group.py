@@ -7,7 +7,8 @@ their clocks differ, so their path times drift apart by the difference of `clock
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -27,7 +28,10 @@ FOLLOWING_ERROR_FACTOR = 2.0
 
 
 class PlcGroup:
-    """The simulated positioner PLCs; `clock_ppm` and `start_late_s` hold one number a positioner."""
+    """The simulated positioner PLCs; `clock_ppm` and `start_late_s` hold one number a positioner.
+
+    `tap(name, sent, data)` hears all bytes.
+    """
 
     def __init__(
         self,
@@ -38,6 +42,7 @@ class PlcGroup:
         start_late_s: Sequence[float] = (),
     ) -> None:
         self._plant, self._cell, self._loop = plant, cell, loop
+        self.tap: Callable[[str, bool, bytes], None] | None = None
         count = len(cell.positioners)
         late_s = tuple(start_late_s) or (0.0,) * count
         has_force = np.repeat([p.load_cell and cell.load_cells is not None for p in cell.positioners], AXES)
@@ -98,9 +103,15 @@ class PlcGroup:
         return ModbusRtuLine(units, end, baud, self._loop)
 
     async def _listen(self, address: Address, units: Mapping[int, PositionerPlc]) -> asyncio.Server:
-        server = await self._loop.create_server(lambda: ModbusTcpConnection(units, self._connections), *address)
+        names = [p.name for p, plc in zip(self._cell.positioners, self.plcs, strict=True) if plc in units.values()]
+        hear = partial(self._hear, "+".join(names))
+        server = await self._loop.create_server(lambda: ModbusTcpConnection(units, self._connections, hear), *address)
         self._servers.append(server)
         return server
+
+    def _hear(self, name: str, sent: bool, data: bytes) -> None:
+        if self.tap is not None:
+            self.tap(name, sent, data)
 
     async def close(self) -> None:
         """Stop scanning, close servers and connections."""

@@ -63,17 +63,22 @@ class IoServer:
         self.registers, self._unit = registers, unit
         self._connections: set[ModbusTcpConnection] = set()
         self._server: asyncio.AbstractServer | None = None
+        self.tap: Callable[[str, bool, bytes], None] | None = None
 
     async def serve(self, host: str, port: int) -> tuple[str, int]:
         """Listen; return the address. Port 0 asks for a free one."""
         units = {self._unit: self.registers}
         loop = asyncio.get_running_loop()
-        server = await loop.create_server(lambda: ModbusTcpConnection(units, self._connections), host, port)
+        server = await loop.create_server(lambda: ModbusTcpConnection(units, self._connections, self._hear), host, port)
         self._server = server
         if not server.sockets:
             return host, port
         bound = server.sockets[0].getsockname()
         return str(bound[0]), int(bound[1])
+
+    def _hear(self, sent: bool, data: bytes) -> None:
+        if self.tap is not None:
+            self.tap(self.registers.name, sent, data)
 
     def drop_connections(self) -> None:
         """Cut every connection."""

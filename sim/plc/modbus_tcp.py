@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Protocol, cast, runtime_checkable
 
 _HEADER = struct.Struct(">HHHBB")
@@ -120,10 +120,15 @@ def answer(units: Mapping[int, RegisterDevice], unit: int, function: int, body: 
 
 
 class ModbusTcpConnection(asyncio.Protocol):
-    """One client connection to a host that holds `units` (unit id -> registers)."""
+    """One client connection to a host that holds `units` (unit id -> registers); `tap(by client, bytes)` hears it."""
 
-    def __init__(self, units: Mapping[int, RegisterDevice], connections: set[ModbusTcpConnection]) -> None:
-        self._units, self._connections = units, connections
+    def __init__(
+        self,
+        units: Mapping[int, RegisterDevice],
+        connections: set[ModbusTcpConnection],
+        tap: Callable[[bool, bytes], None] = lambda sent, data: None,
+    ) -> None:
+        self._units, self._connections, self._tap = units, connections, tap
         self._buffer = b""
         self._transport: asyncio.Transport
 
@@ -141,6 +146,7 @@ class ModbusTcpConnection(asyncio.Protocol):
         return device in self._units.values()
 
     def data_received(self, data: bytes) -> None:
+        self._tap(True, data)
         buffer = self._buffer + data
         replies: list[bytes] = []
         at = 0
@@ -159,4 +165,5 @@ class ModbusTcpConnection(asyncio.Protocol):
             at = end
         self._buffer = buffer[at:]
         if replies:
+            self._tap(False, b"".join(replies))
             self._transport.write(b"".join(replies))
