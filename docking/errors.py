@@ -95,6 +95,10 @@ class ReadBackMismatch(LinkError):
     code = 1007
 
 
+class WatchdogUnproved(LinkError):
+    code = 1008
+
+
 # 2xxx motion -----------------------------------------------------------------------------------------------------
 class MotionError(DockingError):
     """Axes, coupling and stops."""

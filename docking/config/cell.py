@@ -89,6 +89,10 @@ class CanBus(Model):
     drive_timeout_s: Annotated[float, Field(ge=0.05, le=2.0)] = Field(
         default=0.28, description="a drive stops by itself when the master's heartbeat is silent this long, s"
     )
+    prove_watchdog: bool = Field(
+        default=False,
+        description="at every start, with the axes disabled, the heartbeat pauses until every drive has missed it",
+    )
     map: str = Field(default="cia402", description="object map in drivers/maps")
     counts_per_mm: Positive = Field(default=10000.0, description="position units of the drives in one mm")
     identity: DriveIdentity = Field(

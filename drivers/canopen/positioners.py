@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Coroutine, Sequence
 from typing import Any
 
 import numpy as np
 
 from docking.config.cell import CellFile
-from docking.errors import DeviceSilent, EnableFailed, LinkLost, ReadBackMismatch
+from docking.errors import DeviceSilent, EnableFailed, LinkLost, ReadBackMismatch, WatchdogUnproved
 from docking.ports import CanFrame, CanLink
 from docking.types import Array, Feedback, Identity, readonly
 from drivers.canopen import cia402, codec
@@ -25,6 +26,9 @@ from drivers.maps.objects import load_object_map
 _START_UP_S = 1.0
 _EDGE_CYCLES = 3
 """SYNCs for a drive to see an edge in its controlword."""
+_WATCHDOG_MARGIN = 1.1
+"""A drive may miss the heartbeat this much later than it was told: its own clock, its own cycle."""
+_UNDER_TORQUE = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 
 
 class CanopenPositioners:
@@ -52,7 +56,7 @@ class CanopenPositioners:
         self._loop: asyncio.AbstractEventLoop
         self._handlers = self._routes()
         self._keeper: asyncio.TimerHandle | None = None
-        self._keeper_due_s = self._sync_s = self._beat_due_s = 0.0
+        self._keeper_due_s = self._sync_s = self._beat_s = self._beat_due_s = 0.0
         self._lost: str | None = None
         self._open = self._live = self._first = self._sequencing = self._stopping = self._silent = False
 
@@ -73,8 +77,36 @@ class CanopenPositioners:
         await self._all_reporting()
         self._refuse_powered_passive()
         await self._settle_power()
+        if self._bus.prove_watchdog:
+            await self.prove_watchdogs()
         self._watch.rearm()
         return identities
+
+    async def prove_watchdogs(self) -> None:
+        """Withhold the heartbeat until every drive says that it misses it; SYNC goes on. After bring-up, axes disabled.
+
+        Drives that keep this as a fault stay disabled until somebody resets them. Raises WatchdogUnproved naming the
+        axis, also where an axis is enabled; LinkLost.
+        """
+        self._require_link()
+        missed = {(node.index, self._map.host_lost): node.name for node in self._nodes}
+        limit_s = _WATCHDOG_MARGIN * self._bus.drive_timeout_s + 2.0 * self.cycle_s
+        self._watch.rearm()
+        try:
+            for node in self._nodes:
+                if self._image.state(node.index) in _UNDER_TORQUE:
+                    raise WatchdogUnproved(node.name, "the axis is enabled, so it was not tried", limit=limit_s)
+            self._keep()
+            self._beat_due_s = math.inf
+            while waiting := missed.keys() - self._watch.reported:
+                if not (self._loop.time() - self._beat_s <= limit_s):
+                    cause = "object 1016h:01 reads right, but a pause of the heartbeat has no effect"
+                    raise WatchdogUnproved(missed[min(waiting)], cause, limit=limit_s)
+                await self._step()
+        finally:
+            self._beat_due_s = 0.0
+        await self._all_reporting()
+        self._watch.rearm()
 
     async def enable(self) -> Feedback:
         """Enable the driven axes as one group, each first commanded to where it stands; return their read-back.
@@ -250,7 +282,7 @@ class CanopenPositioners:
         frames = self._image.frames()
         # By time, not by cycles: ticks that come late must not stretch what the drives' watchdogs live on.
         if self._image.cycles == 0 or now_s >= self._beat_due_s:
-            self._beat_due_s = now_s + self._bus.heartbeat_s - 0.5 * self.cycle_s
+            self._beat_s, self._beat_due_s = now_s, now_s + self._bus.heartbeat_s - 0.5 * self.cycle_s
             frames = [*frames, self._heartbeat]
             self._watch.check(now_s)
         self._image.cycles += 1

@@ -30,7 +30,8 @@ _KINDS: Final = {
 class NodeWatch:
     """Keeps the most severe fault of any node, the first among equals, until `rearm`.
 
-    `seen_s` holds each node's last heartbeat (loop time).
+    `seen_s` holds each node's last heartbeat (loop time), `reported` the (index, code) of all emergency messages since
+    `rearm`, of conditions that have gone, too.
     """
 
     def __init__(self, nodes: tuple[AxisNode, ...], omap: ObjectMap, heartbeat_s: float) -> None:
@@ -39,6 +40,7 @@ class NodeWatch:
         self.timeout_s = 3.0 * heartbeat_s
         self.seen_s: list[float | None] = [None] * len(nodes)
         self.emergencies: dict[int, int] = {}
+        self.reported: set[tuple[int, int]] = set()
         self._nodes, self._map = nodes, omap
         self._armed = False
         self._states: list[int] = [codec.STATE_BOOT_UP] * len(nodes)
@@ -46,6 +48,7 @@ class NodeWatch:
     def rearm(self) -> None:
         """Forget what was kept and watch from here on."""
         self.worst, self._armed = None, True
+        self.reported.clear()
 
     def disarm(self) -> None:
         """Stop judging (bring-up and closing change node states on purpose)."""
@@ -79,6 +82,7 @@ class NodeWatch:
             self.emergencies.pop(index, None)
             return
         self.emergencies[index] = message.code
+        self.reported.add((index, message.code))
         self._note(index, message.code, self._map.emergency_text(message.code))
 
     def on_foreign(self, index: int) -> None:

@@ -72,6 +72,7 @@ class ObjectMap:
     supported_mode_bit: int
     mode: int
     host_node: int
+    host_lost: int
     identity: dict[str, int]
     proved: dict[str, int]
     objects: dict[str, ObjectEntry]
@@ -124,6 +125,7 @@ def parse_object_map(raw: dict[str, Any]) -> ObjectMap:
         supported_mode_bit=raw["supported_mode_bit"],
         mode=raw["mode"],
         host_node=raw["host_node"],
+        host_lost=raw["host_lost"],
         identity=dict(raw["identity"]),
         proved=dict(raw["proved"]),
         objects=objects,
