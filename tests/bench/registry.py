@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from tests.bench import (
     fault_reaction,
+    modbus_wire,
     planning,
     stop_replan,
     stop_residual,
@@ -18,6 +19,7 @@ GROUPS: dict[str, Group] = {
     "P1": tracker_frames.measure,
     "P3": planning.measure,
     "P4": stop_replan.measure,
+    "P6": modbus_wire.measure,
     "P8": tick_lateness.measure,
     "P9": fault_reaction.measure,
     "P10": stop_residual.measure,
