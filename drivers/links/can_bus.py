@@ -7,6 +7,7 @@ frames that are there arrive in one batch.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
 from collections.abc import Callable
 
@@ -18,6 +19,7 @@ from drivers.links.unix_bus import UnixBus
 
 _WAIT_S = 0.1
 _BATCH = 256
+_LINE_STUCK_S = 0.005
 _BUS_OFF = 0x40
 """Error class of an error frame (linux/can/error.h)."""
 
@@ -61,6 +63,8 @@ class CanBusLink:
         if self._interface == "docking-unix":
             # Works from a source tree too, where no entry point is installed.
             return UnixBus(self._channel)
+        if self._interface == "slcan":
+            return _serial_line(self._channel, self._bitrate)
         return can.Bus(interface=self._interface, channel=self._channel, bitrate=self._bitrate)
 
     def send(self, frames: list[CanFrame]) -> None:
@@ -85,7 +89,11 @@ class CanBusLink:
         if self._thread is not None:
             self._thread.join(timeout=5.0 * _WAIT_S)
             self._thread = None
-        bus.shutdown()
+        try:
+            bus.shutdown()
+        except (can.CanError, OSError):
+            # A dead adapter takes no farewell; its port must be released all the same.
+            _release(bus)
 
     def _lose(self, reason: str) -> None:
         if self._bus is not None:
@@ -98,6 +106,10 @@ class CanBusLink:
             batch = _drain(bus)
         except (can.CanError, OSError) as error:
             self._lose(str(error))
+            return
+        except (ValueError, IndexError) as error:
+            # slcan lines that are no frame: python-can keeps what it could not decode before everything that follows.
+            self._lose(f"the adapter sends what is no frame: {error}")
             return
         self._deliver(batch)
 
@@ -128,6 +140,22 @@ class CanBusLink:
         except RuntimeError:
             # The loop has closed under the thread: nobody is left to tell.
             stopping.set()
+
+
+def _serial_line(channel: str, bitrate: int) -> can.BusABC:
+    """An slcan adapter that never holds the loop: reads return at once, a write that does not get through fails."""
+    bus = can.Bus(interface="slcan", channel=channel, bitrate=bitrate, timeout=0.0)
+    port = getattr(bus, "serialPortOrig", None)
+    if port is not None:
+        port.write_timeout = _LINE_STUCK_S
+    return bus
+
+
+def _release(bus: can.BusABC) -> None:
+    port = getattr(bus, "serialPortOrig", None)
+    if port is not None:
+        with contextlib.suppress(OSError):
+            port.close()
 
 
 def _is_ours(message: can.Message) -> bool:
