@@ -83,6 +83,7 @@ def build_cell(
 
 
 def tracker_of(cell: CellFile, link: SerialLink) -> Tracker:
+    """The driver of the cell's instrument on a serial line."""
     """The tracker of the cell file on `link`, with the noise of its class."""
     noise = noise_of(cell)
 
@@ -112,7 +113,7 @@ def _survey_settings(cell: CellFile, job: JobFile) -> SurveySettings:
     part, mate = job.component, job.mate
 
     def fit(where: str, expansion_sigma: float = 0.0) -> FitSettings:
-        return FitSettings(where=where, min_agreeing=AGREEING_POINTS, expansion_sigma=expansion_sigma)
+        return FitSettings(where=where, min_agreeing=AGREEING_POINTS, majority=True, expansion_sigma=expansion_sigma)
 
     return SurveySettings(
         passes=job.measuring.passes,

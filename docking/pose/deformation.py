@@ -1,122 +1,201 @@
-"""Is the part bent? Many small residuals that follow one smooth shape are no outliers: the part is deformed.
+"""Is the part deformed? Many residuals that follow one smooth field are no outliers.
 
-Along the longest principal axis x of the targets (lengths in units of half their extent) the shapes are bending in two
-planes, quadratic and cubic, as a slender beam takes it (a cross-section stays plane and turns with the axis), torsion,
-and growth. The points are explained twice, by a rigid part with some points moved, and by a part of these shapes; the
-explanations compete by the Bayesian information criterion: chi-square plus ln(3 n) for each free number.
+Two explanations of the same points compete by their evidence (Bayes; -2 ln of the probability of the data):
+
+* a rigid part, and some points that moved each by itself, by an amount of any size (the size that suits it best);
+* a part whose points are displaced by a smooth random field: a Gaussian process of the amplitude that suits best. Along
+  the longest direction x its covariance is `exp(-(x - x')^2 / (2 l^2))`, l the length over which a part bends; the
+  displacement is free (bending), about the longest axis (torsion), or away from the middle in proportion (growth). A
+  last field is smooth in space and has no name: the part is then called by the likeliest of the others.
+
+The pose is integrated out in both, so what a rigid motion could do costs the field nothing.
 """
 
 from __future__ import annotations
 
-from math import log
 from typing import NamedTuple
 
 import numpy as np
 
+from docking.pose.layout import spread
 from docking.pose.least_squares import design
 from docking.pose.quantiles import chi2_tail
-from docking.pose.snooping import Pairs, Tested, solve
+from docking.pose.snooping import Pairs, Tested
 from docking.pose.uncertainty import total_cov_mm2
-from docking.types import Array
+from docking.types import Array, Pose
 
-SHAPES = ("bending", "bending", "bending", "bending", "torsion", "growth")
-_EVIDENCE = 12.0
-"""By how much the criterion must prefer the deformed part; 10 is called very strong evidence."""
+_SMOOTH = 0.6
+"""Length of the field, in extents of the part along its longest direction."""
+_LARGEST = 5e-3
+"""Largest amplitude, in the same extents: beyond it is another part."""
+_EVIDENCE = 10.0
+"""By how much the field must be ahead: e^5 times as likely."""
 _CHANCE = 1e-5
-"""Without any rejected point the rigid fit must be as improbable as this before shapes are asked at all."""
+"""Without any rejected point the rigid fit must be as improbable as this before a field is asked for at all."""
+_NOISE = 1.5
+"""A field below this many times the points' noise (all coordinates together) does no harm that noise does not."""
+_LEFT_OUT = 3
+"""Events that may be left out before the field is given up."""
+_MOST_POINTS = 40
+"""Of more points only so many are looked at."""
+_UNIT = np.array([1e-3] * 3 + [1.0] * 3)
+"""Scale of [rad, mm] that keeps the systems well conditioned on parts of metres."""
 
 
 class Deformation(NamedTuple):
-    """What the part does: the strongest shape, how far it carries a point of the part at most, mm, and what noise
-    would pass for it, mm."""
+    """What the part does: its shape in a word, how far it carries a point at most, mm, and what would pass as noise."""
 
     shape: str
     largest_mm: float
     noise_mm: float
 
 
-class _Shaped(NamedTuple):
-    """A fit of pose and shapes: chi-square, shapes that the layout shows, displacement of each (n, 3, 6), T_i (n,)."""
+class _Scene(NamedTuple):
+    """Rows looked at and, for each: residual of the rigid fit (m, 3), covariance (m, 3, 3), pose's design (m, 3, 6)."""
 
-    chi2: float
-    shown: int
+    rows: list[int]
+    r: Array
+    cov: Array
+    a: Array
+
+    def without(self, row: int) -> _Scene:
+        """The scene less one row."""
+        k = self.rows.index(row)
+        keep = [i for i in range(len(self.rows)) if i != k]
+        return _Scene([self.rows[i] for i in keep], self.r[keep], self.cov[keep], self.a[keep])
+
+
+class _Field(NamedTuple):
+    """The best field: its cost, the displacement it gives each row (m, 3), how surprising each row is with it (m,)."""
+
+    shape: str
+    cost: float
     moves_mm: Array
-    statistic: Array
-    noise_mm: float
+    surprise: Array
 
 
-def shape_fields(nominal_mm: Array) -> Array:
-    """Displacements (n, 3, 6) in N of unit shapes, in the order of SHAPES; 1 mm where x is at its end."""
-    centred = nominal_mm - nominal_mm.mean(axis=0)
-    axes = np.linalg.svd(centred, full_matrices=True)[2]
-    local = centred @ axes.T
-    x, y, z = local.T / max(float(np.max(np.abs(local[:, 0]))), 1e-9)
-    o = np.zeros_like(x)
-    fields = np.array(
-        [
-            [-2.0 * x * y, x * x, o], [-2.0 * x * z, o, x * x],
-            [-3.0 * x * x * y, x**3, o], [-3.0 * x * x * z, o, x**3],
-            [o, -x * z, x * y], [x, y, z],
-        ]
-    )  # fmt: skip
-    result: Array = np.einsum("ab,kan->nbk", axes, fields)
-    return result
-
-
-def _shaped(pairs: Pairs, rows: list[int], expansion_sigma: float) -> _Shaped:
-    """Pose and shapes fitted to some rows, linear about their rigid fit."""
-    sub = pairs.rows(rows)
-    rigid = solve(sub, expansion_sigma)
-    r = sub.measured_mm - rigid.X_MN.apply(sub.nominal_mm)
-    cov = total_cov_mm2(sub.nominal_cov_mm2, sub.measured_cov_mm2, rigid.X_MN.R)
-    whiten = np.linalg.inv(np.linalg.cholesky(cov))
-    motion = design(rigid.X_MN.apply(sub.nominal_mm), rigid.pivot_mm)[:, :, :6]
-    shapes = rigid.X_MN.R @ shape_fields(sub.nominal_mm)
-    size = np.array([1e3] * 3 + [1.0] * 9)
-    both = np.concatenate([motion, shapes], axis=2) / size
-    a = (whiten @ both).reshape(3 * len(rows), 12)
-    b = (whiten @ r[:, :, None]).reshape(-1)
-    u, s, vt = np.linalg.svd(a, full_matrices=False)
-    held = s > 1e-6 * s[0]
-    x = vt.T @ np.where(held, (u.T @ b) / np.where(held, s, 1.0), 0.0)
-    left = (b - a @ x).reshape(-1, 3)
-    # What a rigid motion could do as well is no deformation: each shape counts by what the motions leave of it.
-    white_motion, white_shapes = (whiten @ v for v in (motion, shapes))
-    gain = np.linalg.lstsq(white_motion.reshape(-1, 6), white_shapes.reshape(-1, 6), rcond=None)[0]
-    moves = (shapes - motion @ gain) * x[6:]
-    noise = float(np.sqrt(np.mean(np.trace(cov, axis1=1, axis2=2))))
-    return _Shaped(float(np.vdot(left, left)), int(np.sum(held)) - 6, moves, np.sum(left * left, axis=1), noise)
-
-
-def _named(found: _Shaped) -> Deformation:
-    """The shape that carries the points farthest."""
-    kinds = dict.fromkeys(SHAPES)
-    sums = {kind: np.sum(found.moves_mm[:, :, [s == kind for s in SHAPES]], axis=2) for kind in kinds}
-    shape = max(sums, key=lambda kind: float(np.sum(sums[kind] ** 2)))
-    largest = float(np.max(np.linalg.norm(np.sum(found.moves_mm, axis=2), axis=1)))
-    return Deformation(shape, largest, found.noise_mm)
-
-
-def deformation(
-    pairs: Pairs, tested: Tested, moved: tuple[int, ...], events: int, expansion_sigma: float
-) -> Deformation | None:
+def deformation(pairs: Pairs, tested: Tested, events: tuple[tuple[int, ...], ...]) -> Deformation | None:
     """How the part is deformed, or None where a rigid part explains the points better.
 
-    `tested` is the rigid fit, `moved` the rows rejected without an explanation, by `events` separate events.
-    A row that no shape explains either is left out of both explanations, the worst first.
+    `tested` is the rigid fit, `events` the rows that moved without another explanation, those that moved alike
+    together. A row that no field explains either counts as an event in both explanations.
     """
-    kept = tested.kept
-    rows, limit = sorted([*kept, *moved]), 3.0 * log(3.0 * (len(kept) + len(moved)))
-    rigid_chi2 = tested.chi2
-    if not moved and chi2_tail(rigid_chi2, 3 * len(kept) - 6) >= _CHANCE:
+    moved = [i for event in events for i in event]
+    if not moved and chi2_tail(tested.chi2, 3 * len(tested.kept) - 6) >= _CHANCE:
         return None
-    while True:
-        found = _shaped(pairs, rows, expansion_sigma)
-        rigid = rigid_chi2 + events * limit
-        if rigid - (found.chi2 + found.shown * limit / 3.0) > _EVIDENCE:
-            return _named(found)
-        worst = max((i for i in rows if i in moved), key=lambda i: found.statistic[rows.index(i)], default=None)
-        if worst is None or events < 2 or found.statistic[rows.index(worst)] < limit:
-            return None
-        rows.remove(worst)
-        events -= 1
+    scene = _scene(pairs, tested, sorted([*tested.kept, *moved]))
+    costs = {event: _event_cost(scene, [i for i in event if i in scene.rows]) for event in events}
+    kept = set(tested.kept)
+    rigid = _rigid_cost(scene, [k for k, i in enumerate(scene.rows) if i in kept]) + sum(costs.values())
+    spent = 0.0
+    for _ in range(_LEFT_OUT + 1):
+        field = _best_field(scene, pairs, tested.solution.X_MN)
+        if rigid - field.cost - spent > _EVIDENCE:
+            found = _described(scene, field)
+            return found if found.largest_mm > found.noise_mm else None
+        worst = max(costs, key=lambda event: _surprise(scene, field, event), default=())
+        if not worst or len(costs) < 2:
+            break
+        spent += costs.pop(worst)
+        for i in worst:
+            scene = scene.without(i) if i in scene.rows else scene
+    return None
+
+
+def _scene(pairs: Pairs, tested: Tested, rows: list[int]) -> _Scene:
+    if len(rows) > _MOST_POINTS:
+        rows = [rows[k] for k in np.linspace(0, len(rows) - 1, _MOST_POINTS).round().astype(int)]
+    q = tested.solution.X_MN.apply(pairs.nominal_mm[rows])
+    q = q + tested.solution.expansion * (q - tested.solution.pivot_mm)
+    cov = total_cov_mm2(pairs.nominal_cov_mm2[rows], pairs.measured_cov_mm2[rows], tested.solution.X_MN.R)
+    a = design(q, tested.solution.pivot_mm)[:, :, :6] * _UNIT
+    return _Scene(rows, pairs.measured_mm[rows] - q, cov, a)
+
+
+def _event_cost(scene: _Scene, rows: list[int]) -> float:
+    """Cost of points displaced by one vector drawn from a normal distribution of the width that suits it best."""
+    if not rows:
+        return 0.0
+    at = [scene.rows.index(i) for i in rows]
+    r = scene.r[at].mean(axis=0)
+    squares = float(r @ np.linalg.solve(scene.cov[at].mean(axis=0) / len(at), r))
+    return 3.0 * float(np.log(max(squares, 3.0) / 3.0)) + 3.0 * len(rows)
+
+
+def _rigid_cost(scene: _Scene, at: list[int]) -> float:
+    """Chi-square of the kept rows, and what is left open of their pose."""
+    solved = np.linalg.solve(scene.cov[at], np.concatenate([scene.r[at][:, :, None], scene.a[at]], axis=2))
+    b, a = solved[:, :, 0].reshape(-1), scene.a[at].reshape(-1, 6)
+    normal = a.T @ solved[:, :, 1:].reshape(-1, 6)
+    rhs = a.T @ b
+    return float(scene.r[at].reshape(-1) @ b - rhs @ np.linalg.solve(normal, rhs) + np.linalg.slogdet(normal)[1])
+
+
+def _best_field(scene: _Scene, pairs: Pairs, X_MN: Pose) -> _Field:
+    """The field whose shape and amplitude explain the rows best."""
+    extent = np.sqrt(12.0) * spread(pairs.nominal_mm).long_mm
+    sigma = float(np.sqrt(np.mean(np.trace(scene.cov, axis1=1, axis2=2)) / 3.0))
+    steps = max(int(np.log2(max(_LARGEST * extent / sigma, 4.0)) / 2.0), 1)
+    kernels = _kernels(pairs.nominal_mm, scene.rows, extent, X_MN.R)
+    fields = [_field(scene, kernel, (sigma * 4.0**k) ** 2) for kernel in kernels.items() for k in range(steps + 1)]
+    best = min(fields, key=lambda field: field.cost)
+    named = min((field for field in fields if field.shape), key=lambda field: field.cost)
+    return best._replace(shape=named.shape)
+
+
+def _kernels(nominal_mm: Array, rows: list[int], extent_mm: float, R_MN: Array) -> dict[str, Array]:
+    """Covariances (3 m, 3 m) in M of the fields of unit amplitude, by the word for their shape."""
+    axes = _principal_axes(nominal_mm)
+    j = (nominal_mm - nominal_mm.mean(axis=0))[rows]
+    m, along = len(rows), j @ axes[0]
+    across = j - np.outer(along, axes[0])
+    smooth = 2.0 * (_SMOOTH * extent_mm) ** 2
+    line = np.exp(-((along[:, None] - along[None, :]) ** 2) / smooth)
+    space = np.exp(-np.sum((j[:, None] - j[None, :]) ** 2, axis=2) / smooth)
+    twist = (np.cross(axes[0], across) / max(float(np.max(np.abs(across))), 1e-9) @ R_MN.T).reshape(-1)
+    growth = (j / (extent_mm / 2.0) @ R_MN.T).reshape(-1)
+    each = np.ones((3, 3))
+    return {
+        "bending": np.kron(line, np.eye(3)),
+        "torsion": np.kron(line, each) * np.outer(twist, twist),
+        "growth": np.kron(np.ones((m, m)), each) * np.outer(growth, growth),
+        "": np.kron(space, np.eye(3)),
+    }
+
+
+def _principal_axes(points_mm: Array) -> Array:
+    """Rows (3, 3): the directions in which points (n, 3) extend most, second, least."""
+    axes: Array = np.linalg.svd(points_mm - points_mm.mean(axis=0), full_matrices=True)[2]
+    return axes
+
+
+def _field(scene: _Scene, named: tuple[str, Array], variance_mm2: float) -> _Field:
+    """One shape and amplitude: cost `r^T C^-1 r + ln det C / det S + ln det A^T C^-1 A` with the pose at its best."""
+    (shape, kernel), m = named, len(scene.rows)
+    noise = np.zeros((3 * m, 3 * m))
+    for k, cov in enumerate(scene.cov):
+        noise[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = cov
+    inverse = np.linalg.inv(noise + variance_mm2 * kernel)
+    a, r = scene.a.reshape(-1, 6), scene.r.reshape(-1)
+    normal = a.T @ inverse @ a
+    left = r - a @ np.linalg.solve(normal, a.T @ inverse @ r)
+    pull = inverse @ left
+    cost = float(left @ pull) - float(np.linalg.slogdet(inverse)[1]) + float(np.linalg.slogdet(normal)[1])
+    own = inverse.reshape(m, 3, m, 3)[np.arange(m), :, np.arange(m), :]
+    pulls = pull.reshape(m, 3)
+    surprise = np.einsum("ni,ni->n", pulls, np.linalg.solve(own, pulls[:, :, None])[:, :, 0])
+    cost -= float(np.sum(np.linalg.slogdet(scene.cov)[1]))
+    return _Field(shape, cost, (variance_mm2 * kernel @ pull).reshape(m, 3), surprise)
+
+
+def _surprise(scene: _Scene, field: _Field, event: tuple[int, ...]) -> float:
+    """How badly the field predicts the worst point of an event from all other points."""
+    return max((float(field.surprise[scene.rows.index(i)]) for i in event if i in scene.rows), default=0.0)
+
+
+def _described(scene: _Scene, field: _Field) -> Deformation:
+    """The field less its rigid part."""
+    a, whole = scene.a.reshape(-1, 6), field.moves_mm.reshape(-1)
+    u = (whole - a @ np.linalg.lstsq(a, whole, rcond=None)[0]).reshape(-1, 3)
+    noise = _NOISE * float(np.sqrt(np.mean(np.trace(scene.cov, axis1=1, axis2=2))))
+    return Deformation(field.shape, float(np.max(np.linalg.norm(u, axis=1))), noise)

@@ -19,12 +19,11 @@ _NEARER = 0.2
 
 
 class Reasons(NamedTuple):
-    """A rejection for each row that is out, in its order; the rows that are simply elsewhere, `moved`, and by how many
-    separate events."""
+    """A rejection for each row that is out, in its order; the rows that are simply elsewhere, those that moved alike
+    together."""
 
     rejected: tuple[Rejection, ...] = ()
-    moved: tuple[int, ...] = ()
-    events: int = 0
+    events: tuple[tuple[int, ...], ...] = ()
 
 
 def explain(pairs: Pairs, X_MN: Pose, out: list[int], tolerance_mm: Array) -> Reasons:
@@ -51,8 +50,9 @@ def explain(pairs: Pairs, X_MN: Pose, out: list[int], tolerance_mm: Array) -> Re
     for i in alone:
         detail = f"{float(np.linalg.norm(off[i])):.3f} mm from where the other points put it"
         named.setdefault(i, Rejection(pairs.names[i], "mis-aimed", detail))
-    events = len(alone) - sum(len(group) - 1 for group in groups)
-    return Reasons(tuple(named[i] for i in out), tuple(alone), events)
+    grouped = {i for group in groups for i in group}
+    events = (*map(tuple, groups), *((i,) for i in alone if i not in grouped))
+    return Reasons(tuple(named[i] for i in out), events)
 
 
 def _nest(places: Array, measured_mm: Array, i: int, reach_mm: float) -> int | None:

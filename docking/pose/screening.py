@@ -96,13 +96,16 @@ def _screen_pairs(pairs: Pairs, averaged: Averaged, settings: FitSettings) -> Sc
     _check_mirror(pairs.rows(graph.clique), graph, settings)
     scaled, given = graph.sigma_mm is not None, pairs
     pairs = given if graph.sigma_mm is None else _with_sigma(given, graph.sigma_mm)
-    tested = _best(pairs, graph, settings)
+    tested, rival = _best(pairs, graph, settings)
     if scaled:
         pairs = _with_sigma(given, _posterior_sigma_mm(pairs, tested))
     inside = set(tested.kept)
     out = [i for i in range(len(pairs.names)) if i not in inside]
     why = explain(pairs, tested.solution.X_MN, out, graph.tolerance_mm)
-    _check_deformed(pairs, tested, why, settings)
+    if not scaled or why.events:
+        # Without stated sigmas the residuals set their own scale: nothing tells a deformed part from a coarse one.
+        _check_deformed(pairs, tested, why, settings)
+    _check_unique(pairs, tested, rival, settings)
     _check_believable(graph, tested, why, settings)
     kept = pairs.rows(tested.kept)
     return Screened(
@@ -205,8 +208,8 @@ def _check_mirror(pairs: Pairs, graph: _Graph, settings: FitSettings) -> None:
         raise NotCongruent(settings.where, cause, value=0, limit=settings.min_agreeing)
 
 
-def _best(pairs: Pairs, graph: _Graph, settings: FitSettings) -> Tested:
-    """The consistent set that explains the points best, snooped. Raises AmbiguousSet where another does nearly so.
+def _best(pairs: Pairs, graph: _Graph, settings: FitSettings) -> tuple[Tested, list[int]]:
+    """The consistent set that explains the points best, snooped, and the rows of a rival as good (none: empty).
 
     All cliques of the largest size and one below it compete; in a large graph the largest only.
     """
@@ -220,17 +223,25 @@ def _best(pairs: Pairs, graph: _Graph, settings: FitSettings) -> Tested:
         if clique is graph.clique or spread(pairs.nominal_mm[clique]).middle_mm > _least_middle_mm(pairs):
             tested = snoop(pairs, clique, settings, scaled)
             found.setdefault(tuple(tested.kept), tested)
-    best, *others = sorted(found.values(), key=lambda t: t.cost)
-    kept = set(best.kept)
-    rivals = [t.kept for t in others if len(kept) <= len(t.kept) and len(kept & set(t.kept)) < MIN_POINTS and _holds(t)]
+    held = {kept: scaled or _holds(tested) for kept, tested in found.items()}
+    best, *others = sorted(found.values(), key=lambda t: (not held[tuple(t.kept)], -len(t.kept), t.chi2))
     if n > _RIVALS_UP_TO:
-        rival = bits(rival_clique(graph.adj, sum(1 << i for i in best.kept), len(graph.clique)))
-        rivals = [rival] if rival else []
-    if rivals:
-        first, second = (", ".join(pairs.names[i] for i in rows[:8]) for rows in (best.kept, rivals[0]))
-        cause = f"{first} agree among themselves, and so do {second}"
-        raise AmbiguousSet(settings.where, cause, value=len(rivals[0]))
-    return best
+        return best, bits(rival_clique(graph.adj, sum(1 << i for i in best.kept), len(graph.clique)))
+    kept = set(best.kept)
+    for t in others:
+        if len(t.kept) >= len(kept) and len(kept & set(t.kept)) < MIN_POINTS and held[tuple(t.kept)]:
+            return best, t.kept
+    return best, []
+
+
+def _check_unique(pairs: Pairs, tested: Tested, rival: list[int], settings: FitSettings) -> None:
+    """Refuse when other points, with at most two of the kept ones, agree among themselves just as many."""
+    if rival:
+        first, second = sorted((tested.kept, rival))
+        cause = " agree among themselves, and so do ".join(
+            ", ".join(pairs.names[i] for i in rows[:8]) for rows in (first, second)
+        )
+        raise AmbiguousSet(settings.where, cause, value=len(rival))
 
 
 def _holds(tested: Tested) -> bool:
@@ -245,7 +256,7 @@ def _least_middle_mm(pairs: Pairs) -> float:
 
 def _check_deformed(pairs: Pairs, tested: Tested, why: Reasons, settings: FitSettings) -> None:
     """Refuse a part whose points follow a smooth shape. Swapped, misplaced or misread points have nothing to say."""
-    found = deformation(pairs, tested, why.moved, why.events, settings.expansion_sigma)
+    found = deformation(pairs, tested, why.events)
     if found is not None:
         error = ComponentDeformed(settings.where, found.shape, value=found.largest_mm, limit=found.noise_mm)
         error.rejected = why.rejected
@@ -256,7 +267,7 @@ def _check_believable(graph: _Graph, tested: Tested, why: Reasons, settings: Fit
     """Refuse a set that chance could bring together, a minority where that is asked, and points put out one by one."""
     kept, n = len(tested.kept), len(graph.adj)
     chance = _accidental(graph, tested.kept)
-    unexplained = len(why.moved)
+    unexplained = sum(map(len, why.events))
     error = None
     if 2 * kept <= n and not (chance <= _ACCIDENTS):
         cause = f"so many agree by chance: {chance:.2g} such sets are to be expected; another part, or sigmas too small"

@@ -45,15 +45,13 @@ class Pairs(NamedTuple):
 
 class Tested(NamedTuple):
     """Outcome of the snooping: rows kept, the pose they define, statistic over its threshold a point (n,), how many
-    points the test put out, chi-square of the kept ones, and the cost of it all: chi-square and the threshold of the
-    test for each of the others."""
+    points the test put out, and chi-square of the kept ones."""
 
     kept: list[int]
     solution: Solution
     ratio: Array
     snooped: int
     chi2: float
-    cost: float
 
 
 def solve(pairs: Pairs, expansion_sigma: float) -> Solution:
@@ -134,13 +132,10 @@ def snoop(pairs: Pairs, kept: list[int], settings: FitSettings, scaled: bool) ->
             kept = sorted([*kept, nearest])
         else:
             break
-    chi2 = chi_square(pairs.rows(kept), solution)
-    left = len(pairs.names) - len(kept)
-    cost = chi2 + (left * chi2_upper(settings.false_alarm / len(pairs.names), 3) if left else 0.0)
-    return Tested(kept, solution, ratio, len(banned), chi2, cost)
+    return Tested(kept, solution, ratio, len(banned), _chi_square(pairs.rows(kept), solution))
 
 
-def chi_square(pairs: Pairs, solution: Solution) -> float:
+def _chi_square(pairs: Pairs, solution: Solution) -> float:
     """Sum of r^T S^-1 r of all the pairs."""
     r = residuals_mm(pairs, solution)
     s = total_cov_mm2(pairs.nominal_cov_mm2, pairs.measured_cov_mm2, solution.X_MN.R)

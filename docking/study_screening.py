@@ -1,0 +1,149 @@
+"""How many wrong points the screening survives: Monte Carlo over layouts, kinds of error and numbers of points.
+
+A success is complete: every wrong point left out, no good point lost, and the pose at most 1.5 times as far off as the
+fit of the good points alone. A refusal is no success; refusals are counted by their error.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from docking.errors import PoseError
+from docking.geometry import exp_so3
+from docking.pose import LASER_TRACKER, FitSettings, fit_pose, screen
+from docking.types import Array, Points, Pose, Screened
+
+Generator = np.random.Generator
+Say = Callable[[str], None]
+
+RADIUS_MM, HALF_LENGTH_MM = 1975.0, 4500.0
+SIGMA_MM = 0.05
+STATION_C_MM = (500.0, -9000.0, 800.0)
+WORST_POSE = 1.5
+"""Largest error at the points against the fit of the good points alone."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """`wrong` of `n` points are wrong in one way; the share of draws that must succeed, or may fail when clean."""
+
+    kind: str
+    n: int
+    wrong: int
+    bar: float = 0.95
+
+    @property
+    def name(self) -> str:
+        return f"{self.kind} {self.wrong} of {self.n}"
+
+
+CASES = (
+    *(Case("clean", n, 0, 0.99) for n in (7, 10, 15, 20)),
+    *(Case("mis-aimed", n, k) for n, k in ((7, 4), (10, 7), (15, 10), (20, 15))),
+    *(Case("swapped", n, k) for n, k in ((7, 4), (10, 7), (15, 10), (20, 15))),
+    *(Case("slid", n, k) for n, k in ((7, 3), (10, 4), (15, 7), (20, 8))),
+)
+NOISES = ("isotropic", "tracker")
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One drawn set: `nominal` in C, `measured` in W, the true pose X_WC and the rows that are wrong."""
+
+    nominal: Points
+    measured: Points
+    X_WC: Pose
+    wrong: list[int]
+
+
+def barrel(rng: Generator, n: int) -> Array:
+    """Points (n, 3) on a fuselage section of 9 m, mm."""
+    x, angle = rng.uniform(-HALF_LENGTH_MM, HALF_LENGTH_MM, n), rng.uniform(0.0, 2.0 * np.pi, n)
+    return np.column_stack([x, RADIUS_MM * np.cos(angle), RADIUS_MM * np.sin(angle)])
+
+
+def spoil(rng: Generator, p_mm: Array, kind: str, rows: list[int]) -> None:
+    """Make `rows` of the measured points (n, 3) wrong: aimed 1-30 mm off, swapped among themselves, slid by 2 mm."""
+    directions = rng.normal(size=(len(rows), 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    if kind == "mis-aimed":
+        p_mm[rows] += directions * rng.uniform(1.0, 30.0, (len(rows), 1))
+    elif kind == "swapped":
+        p_mm[rows] = p_mm[[rows[i] for i in _derangement(rng, len(rows))]]
+    elif kind == "slid":
+        p_mm[rows] += 2.0 * directions[0]
+
+
+def _derangement(rng: Generator, n: int) -> Array:
+    while True:
+        order = rng.permutation(n)
+        if not np.any(order == np.arange(n)):
+            return order
+
+
+def _anywhere(rng: Generator) -> Pose:
+    turn = rng.normal(size=3)
+    return Pose(exp_so3(turn / np.linalg.norm(turn) * rng.uniform(0.0, np.pi)), rng.uniform(-5000.0, 5000.0, 3))
+
+
+def draw(rng: Generator, case: Case, noise: str) -> Draw:
+    """A random section at a random pose, measured once."""
+    j, X = barrel(rng, case.n), _anywhere(rng)
+    p = X.apply(j)
+    cov = np.tile(SIGMA_MM**2 * np.eye(3), (case.n, 1, 1))
+    if noise == "tracker":
+        cov = LASER_TRACKER.covariance(p - X.apply(STATION_C_MM))
+    p = p + np.einsum("nij,nj->ni", np.linalg.cholesky(cov), rng.normal(size=p.shape))
+    wrong = sorted(rng.permutation(case.n)[: case.wrong].tolist())
+    spoil(rng, p, case.kind, wrong)
+    names = tuple(f"T{i + 1}" for i in range(case.n))
+    return Draw(Points(names, j, np.zeros((case.n, 3, 3))), Points(names, p, cov), X, wrong)
+
+
+def verdict(drawn: Draw, settings: FitSettings) -> str:
+    """`success`, or what went wrong: the refusal's error, `missed`, `good point rejected`, `pose`."""
+    try:
+        screened = screen(drawn.nominal, drawn.measured, settings)
+    except PoseError as error:
+        return f"refused: {type(error).__name__}"
+    out = {drawn.nominal.names.index(r.name) for r in screened.rejected}
+    if not set(drawn.wrong) <= out:
+        return "missed"
+    if out != set(drawn.wrong):
+        return "good point rejected"
+    mine, clean = (_off_mm(drawn, s, settings) for s in (screened, _good(drawn)))
+    return "success" if mine <= WORST_POSE * clean else "pose"
+
+
+def _good(drawn: Draw) -> Screened:
+    rows = [i for i in range(len(drawn.nominal)) if i not in drawn.wrong]
+    a, b = drawn.nominal, drawn.measured
+    names = tuple(a.names[i] for i in rows)
+    return Screened(names, a.xyz_mm[rows], a.cov_mm2[rows], b.xyz_mm[rows], b.cov_mm2[rows])
+
+
+def _off_mm(drawn: Draw, screened: Screened, settings: FitSettings) -> float:
+    """Largest error of the fitted pose at any target, wrong ones included."""
+    gap = fit_pose(screened, settings).X_MN.apply(drawn.nominal.xyz_mm) - drawn.X_WC.apply(drawn.nominal.xyz_mm)
+    return float(np.max(np.linalg.norm(gap, axis=1)))
+
+
+def run_case(case: Case, noise: str, draws: int, seed: int = 1) -> dict[str, Any]:
+    """Counts of `verdict` over `draws` draws, and whether the bar holds."""
+    rng = np.random.default_rng([seed, case.n, case.wrong, NOISES.index(noise)])
+    counts = Counter(verdict(draw(rng, case, noise), FitSettings()) for _ in range(draws))
+    share = counts["success"] / draws
+    return {
+        "case": case.name,
+        "noise": noise,
+        "draws": draws,
+        "success": share,
+        "bar": case.bar,
+        "held": bool(share >= case.bar),
+        "verdicts": dict(counts),
+    }
