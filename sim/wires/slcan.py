@@ -1,8 +1,8 @@
 """A USB-to-CAN adapter that speaks the serial-line CAN protocol (slcan, Lawicel): text on one side, a bus on the other.
 
 Lines end with CR. From the computer: `Sn` bit rate, `O` open, `C` close, `tiiildd..` a frame: three hexadecimal digits
-of identifier, one of length, two for each byte. To the computer: frames in the same form, CR (BEL) for an order that was
-(was not) obeyed, `z` before the CR of a sent frame.
+of identifier, one of length, two for each byte. To the computer: frames in the same form, CR (BEL) for an order that
+was (was not) obeyed, `z` before the CR of a sent frame.
 """
 
 from __future__ import annotations
