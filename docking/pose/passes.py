@@ -108,6 +108,8 @@ def average_passes(points: Points, settings: FitSettings) -> Averaged:
     Out with a reason: `lost-beam` (no usable reading), `passes-disagree` (no majority among the readings).
     Raises StationMoved when the passes differ from each other by one common motion.
     """
+    if len(set(points.names)) == len(points.names):
+        return _single_readings(points)
     result, usable, numbers = Averaged(), {}, _pass_numbers(points)
     for name, rows in _by_name(points).items():
         good = [i for i in rows if not lost_beam(points.xyz_mm[i])]
@@ -129,6 +131,20 @@ def average_passes(points: Points, settings: FitSettings) -> Averaged:
     moved = _moved_between(tables, scatter) if 2 * disagreeing > len(usable) else None
     if moved is not None:
         raise StationMoved(settings.where, "the passes differ by one common motion", value=moved, limit=4.0 * scatter)
+    return result
+
+
+def _single_readings(points: Points) -> Averaged:
+    """What `average_passes` gives when every point has one reading: nothing to compare, only lost beams to leave out."""
+    result = Averaged()
+    seen = np.all(np.isfinite(points.xyz_mm), axis=1) & np.any(points.xyz_mm != 0.0, axis=1)
+    for name, xyz, cov, good in zip(points.names, points.xyz_mm, points.cov_mm2, seen, strict=True):
+        if good:
+            result.names.append(name)
+            result.xyz_mm.append(xyz)
+            result.cov_mm2.append(cov)
+        else:
+            result.rejected.append(Rejection(name, "lost-beam", "no reading other than (0, 0, 0) in 1 pass(es)"))
     return result
 
 

@@ -92,7 +92,8 @@ def _screen_pairs(pairs: Pairs, averaged: Averaged, settings: FitSettings) -> Sc
     graph = _consistency(pairs, settings)
     if not (len(graph.clique) >= min(settings.min_agreeing, MIN_POINTS)):
         raise _not_congruent(pairs, graph, settings)
-    check_layout(pairs.nominal_mm[graph.clique], settings)
+    if len(graph.clique) < len(pairs.names):
+        check_layout(pairs.nominal_mm[graph.clique], settings)
     _check_mirror(pairs.rows(graph.clique), graph, settings)
     scaled, given = graph.sigma_mm is not None, pairs
     pairs = given if graph.sigma_mm is None else _with_sigma(given, graph.sigma_mm)
@@ -200,8 +201,10 @@ def _check_mirror(pairs: Pairs, graph: _Graph, settings: FitSettings) -> None:
     r = pairs.measured_mm - fit_svd(pairs.nominal_mm, pairs.measured_mm).apply(pairs.nominal_mm)
     proper = float(np.sqrt(np.mean(np.sum(r * r, axis=1))))
     limit = float(np.max(graph.tolerance_mm[np.ix_(graph.clique, graph.clique)]))
+    if proper <= 3.0 * limit:
+        return
     reflected = mirrored_rms_mm(pairs.nominal_mm, pairs.measured_mm)
-    if proper > 3.0 * limit and 3.0 * reflected < proper:
+    if 3.0 * reflected < proper:
         cause = (
             f"they are its mirror image (rms {proper:.3g} mm, reflected {reflected:.3g} mm): an axis has the wrong sign"
         )

@@ -19,6 +19,7 @@ class Sizes:
     study_seeds: int = 24
     study_repeats: int = 3
     lateness_s: float = 60.0
+    epochs: int = 100_000
     tracker_frames: int = 5000
 
 
@@ -30,6 +31,7 @@ TINY = Sizes(
     study_seeds=2,
     study_repeats=1,
     lateness_s=0.3,
+    epochs=200,
     tracker_frames=50,
 )
 """Enough to see that everything runs; the ratios mean nothing."""

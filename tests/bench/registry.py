@@ -6,6 +6,7 @@ from tests.bench import (
     fault_reaction,
     modbus_wire,
     planning,
+    pose_fit,
     stop_replan,
     stop_residual,
     study,
@@ -17,6 +18,7 @@ from tests.bench.metric import Group
 
 GROUPS: dict[str, Group] = {
     "P1": tracker_frames.measure,
+    "P2": pose_fit.measure,
     "P3": planning.measure,
     "P4": stop_replan.measure,
     "P6": modbus_wire.measure,
