@@ -14,6 +14,7 @@ from typing import Any
 
 import click
 
+from docking.cli_devices import devices, monitor
 from docking.cli_survey import layout, network
 from docking.errors import (
     EXIT_FAULT,
@@ -286,6 +287,8 @@ def study_dock(cells: tuple[Path, ...], as_json: bool, **options: Any) -> int:
 
 
 cli.add_command(layout)
+cli.add_command(devices)
+cli.add_command(monitor)
 cli.add_command(network)
 
 

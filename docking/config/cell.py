@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import date
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -45,6 +46,9 @@ class TrackerConfig(Model):
     measure_timeout_s: Positive = Field(default=15.0, description="longest time one point may take, s")
     seating_um: NonNegative = Field(
         default=10.0, description="repeatability of a reflector in its nest, 1 sigma a coordinate, um"
+    )
+    calibration_due: date | None = Field(
+        default=None, description="date on which the instrument is due for calibration; `docking devices` warns after it"
     )
     two_face: bool = Field(default=False, description="the instrument measures in both faces")
     two_face_limit_mm: Positive = Field(

@@ -1,0 +1,181 @@
+"""`docking devices`: who answers on the wires of a cell, and what is wrong with it. Nothing is enabled."""
+
+from __future__ import annotations
+
+import asyncio
+import statistics
+from datetime import date
+from typing import Any
+
+from docking.assemble.controller import tracker_of
+from docking.assemble.looking import Ends, LookRequest, load_looked_at, wires_of
+from docking.assemble.real_time import run_real
+from docking.assemble.timed import TimedCan, TimedSerial
+from docking.config import CellFile
+from docking.config.cell import CanBus
+from docking.errors import DockingError, LinkError
+from docking.ports import CanLink
+from drivers.canopen.look import BusLook
+from drivers.canopen.positioners import CanopenPositioners
+from drivers.look import Found
+from drivers.modbus_look import ModbusLook
+from drivers.modbus_positioners import ModbusPositioners
+
+PROVE_S = 1.0
+"""How long the read-backs of a bus are timed."""
+
+
+def find_devices(request: LookRequest, *, prove: bool = False) -> dict[str, Any]:
+    """Everything that `docking devices` says, as plain data. Raises ConfigError.
+
+    With `prove` the settings of positioners are written and read back as before a docking; nothing is enabled.
+    """
+    cell = load_looked_at(request)
+
+    async def main() -> dict[str, Any]:
+        async with wires_of(request, cell) as ends:
+            rows = [await _tracker(cell, ends)]
+            skew = None
+            if ends.can is not None:
+                rows += await _bus(cell, ends.can)
+            look = ModbusLook(cell, ends.modbus, ends.transcript.modbus if ends.transcript is not None else None)
+            try:
+                rows += await look.find()
+                skew = await look.start_skew_s()
+            finally:
+                look.close()
+            proof, measured = await _prove(cell, ends) if prove else (None, None)
+            return _report(cell, rows, skew or measured, proof)
+
+    return run_real(main, ticks=prove)
+
+
+async def _tracker(cell: CellFile, ends: Ends) -> Found:
+    timed = TimedSerial(ends.serial)
+    tracker = tracker_of(cell, timed)
+    identity, problem = None, None
+    try:
+        identity = await tracker.connect()
+    except DockingError as error:
+        problem = error
+    finally:
+        await tracker.close()
+    settings = cell.tracker
+    address = f"{ends.port} at {settings.baud} bit/s, {settings.protocol}"
+    return Found("tracker", address, identity, "", "", "", tuple(timed.taken_s), problem)
+
+
+async def _bus(cell: CellFile, link: CanLink) -> tuple[Found, ...]:
+    look = BusLook(cell, link)
+    try:
+        await look.open()
+        found = await look.find()
+    except LinkError as error:
+        return (Found("bus", f"{error.value}", problem=error),)
+    finally:
+        look.close()
+    if look.controlled:
+        found = (*found, Found("not in the cell", "SYNC", state="another controller runs this bus"))
+    return found
+
+
+async def _prove(cell: CellFile, ends: Ends) -> tuple[DockingError | None, tuple[float, float] | None]:
+    """Bring the positioners up as before a docking, enable nothing, release them; what failed, and the spread of the
+    read-backs of one SYNC."""
+    positioners: CanopenPositioners | ModbusPositioners
+    timed: TimedCan | None = None
+    if isinstance(cell.bus, CanBus) and ends.can is not None:
+        nodes = [axis.node or 0 for p in cell.positioners for axis in p.axes]
+        timed = TimedCan(ends.can, frozenset(0x180 + node for node in nodes))
+        positioners = CanopenPositioners(cell, timed)
+    else:
+        positioners = ModbusPositioners(cell, ends.modbus, ends.transcript.modbus if ends.transcript else None)
+    problem = None
+    try:
+        await positioners.bring_up()
+        await asyncio.sleep(PROVE_S if timed is not None else 0.0)
+    except DockingError as error:
+        problem = error
+    try:
+        await positioners.close()
+    except DockingError as error:
+        problem = problem or error
+    if timed is None or not timed.late_s:
+        return problem, None
+    typical = [statistics.median(late) for late in timed.late_s.values()]
+    return problem, (max(typical) - min(typical), max(statistics.pstdev(late) for late in timed.late_s.values()))
+
+
+# what is told ------------------------------------------------------------------------------------------------------
+def _report(
+    cell: CellFile, rows: list[Found], skew: tuple[float, float] | None, proof: DockingError | None
+) -> dict[str, Any]:
+    devices = [_row(found) for found in rows]
+    due = cell.tracker.calibration_due
+    today = date.today()
+    warnings = []
+    if due is not None and due < today:
+        warnings.append(f"the calibration of the instrument was due on {due}, {(today - due).days} days ago")
+    if due is None:
+        warnings.append("tracker.calibration_due is not given: nobody watches the calibration of the instrument")
+    warnings += [f"{row['address']} answers and belongs to nothing in the cell file" for row in devices if row["stray"]]
+    missing = [row["where"] for row in devices if row["problem"] is not None]
+    return {
+        "cell": cell.name,
+        "ok": not missing and proof is None,
+        "devices": devices,
+        "missing": missing,
+        "start_skew_ms": None if skew is None else 1e3 * skew[0],
+        "start_skew_known_to_ms": None if skew is None else 1e3 * skew[1],
+        "calibration_due": str(due) if due is not None else None,
+        "bring_up": None if proof is None else {"code": proof.code, "message": proof.text(), "where": proof.where},
+        "warnings": warnings,
+    }
+
+
+def _row(found: Found) -> dict[str, Any]:
+    identity, taken = found.identity, found.round_trips_s
+    problem = found.problem
+    return {
+        "where": found.where,
+        "address": found.address,
+        "answers": identity is not None,
+        "stray": found.where == "not in the cell",
+        "vendor": identity.vendor if identity else None,
+        "product": identity.product if identity else None,
+        "serial": identity.serial if identity else None,
+        "firmware": identity.firmware if identity else None,
+        "state": found.state or None,
+        "units": found.units or None,
+        "watchdog": found.watchdog or None,
+        "round_trip_ms": 1e3 * statistics.median(taken) if taken else None,
+        "round_trip_max_ms": 1e3 * max(taken) if taken else None,
+        "problem": None if problem is None else {"code": problem.code, "message": problem.text()},
+    }
+
+
+def devices_text(report: dict[str, Any]) -> str:
+    """The same for people: two or three lines a device, then what is wrong."""
+    lines = []
+    for row in report["devices"]:
+        mark = "!!" if row["problem"] else "--" if row["stray"] else "ok"
+        who = " ".join(filter(None, (row["vendor"], row["product"])))
+        lines.append(f"{mark} {row['where']:<18} {row['address']:<28} {who}")
+        trip = row["round_trip_ms"]
+        facts = [f"serial {row['serial']}, firmware {row['firmware']}" if row["answers"] else "", row["state"]]
+        facts += [row["units"], f"watchdog: {row['watchdog']}" if row["watchdog"] else ""]
+        facts.append(f"round trip {trip:.2f} ms, at most {row['round_trip_max_ms']:.2f}" if trip is not None else "")
+        lines += [f"      {fact}" for fact in facts if fact]
+        if row["problem"]:
+            lines.append(f"      {row['problem']['code']}: {row['problem']['message']}")
+    skew = report["start_skew_ms"]
+    if skew is not None:
+        lines.append(f"start skew as measured: {skew:.2f} ms, known to {report['start_skew_known_to_ms']:.2f} ms")
+    if report["calibration_due"]:
+        lines.append(f"calibration of the instrument due: {report['calibration_due']}")
+    if report["bring_up"]:
+        lines.append(f"bring-up refused: {report['bring_up']['code']}: {report['bring_up']['message']}")
+    lines += [f"warning: {text}" for text in report["warnings"]]
+    missing = ", ".join(report["missing"])
+    lines.append("every device of the cell answers as it should" if report["ok"] else f"NOT IN ORDER: {missing}")
+    return "\n".join(lines)

@@ -1,0 +1,71 @@
+"""The wires of a cell for commands that only look: real ones, or simulated devices on real wires."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import AsyncIterator
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from docking.assemble.requests import WireChoice, opened, read_wires
+from docking.assemble.simulated import make_far_end, real_wires, truth_of
+from docking.assemble.wires import Addresses, near_bus
+from docking.config import CellFile
+from docking.config.load import default_job_path, load_cell, load_job
+from docking.ports import CanLink, SerialLink
+from docking.transcript import TranscribedCan, TranscribedSerial, Transcript
+from drivers.links.serial_port import SerialPort
+
+
+@dataclass(frozen=True)
+class LookRequest:
+    """Which cell is looked at, over which wires; `seed` of simulated devices, where the transcript goes."""
+
+    cell_path: Path
+    wires: WireChoice
+    seed: int = 1
+    transcript: Path | None = None
+
+
+@dataclass(frozen=True)
+class Ends:
+    """The near ends of a cell's wires."""
+
+    port: str
+    serial: SerialLink
+    can: CanLink | None
+    modbus: Addresses | None
+    transcript: Transcript | None
+
+
+@asynccontextmanager
+async def wires_of(request: LookRequest, cell: CellFile) -> AsyncIterator[Ends]:
+    """Open what is needed to look at `cell`; released at the end, simulated devices that were started here, too.
+
+    Raises ConfigError.
+    """
+    async with AsyncExitStack() as stack:
+        found: dict[str, object] = {}
+        if request.wires.wires is not None:
+            found = read_wires(request.wires.wires, cell)
+        elif request.wires.sim:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="docking-")))
+            job = load_job(default_job_path(request.cell_path), cell)
+            far = make_far_end(cell, job, truth_of(request.cell_path), request.seed)
+            stack.push_async_callback(far.close)
+            found = await real_wires(cell, far, folder)
+        transcript = opened(request.transcript)
+        port = str(found.get("tracker", cell.tracker.port))
+        serial: SerialLink = SerialPort(port, cell.tracker.baud)
+        can, modbus = near_bus(cell, found)
+        if transcript is not None:
+            stack.callback(transcript.close)
+            serial = TranscribedSerial(serial, transcript, "tracker")
+            can = TranscribedCan(can, transcript) if can is not None else None
+        yield Ends(port, serial, can, modbus, transcript)
+
+
+def load_looked_at(request: LookRequest) -> CellFile:
+    """The cell to look at. Raises ConfigError."""
+    return load_cell(request.cell_path)
