@@ -97,6 +97,19 @@ def test_a_fallen_permissive_stops_all_axes_on_the_path_and_leaves_them_off(tmp_
     assert cell.figure_gap_mm(cell.setpoints_mm()[1], plan).max() <= 0.002
 
 
+@pytest.mark.parametrize("step", [True, False])
+def test_letting_the_enabling_device_go_stops_a_move_that_a_person_asked_for(step, tmp_path):
+    def scenario(run: DryCell) -> None:
+        procedure = run.controller.procedure
+        if step:
+            procedure._settings = dataclasses.replace(procedure._settings, enabling=("enabling",))
+        run.on_move(lambda plan: run.loop.call_later(0.5 * plan.duration_s, run.far.world.hold, "enabling", False))
+
+    cell = run_dry("lab-can", 1, tmp_path, scenario)
+    assert cell.alarms() == ([(2143, "enabling")] if step else [])
+    assert cell.state.value == ("fault" if step else "docked")
+
+
 def test_the_component_that_is_warmer_than_stated_is_fitted_by_its_sensor(tmp_path):
     """2 K over the stated temperature: 23e-6/K over 0.9 m are 41 um, which the sensor takes out of the fit."""
 

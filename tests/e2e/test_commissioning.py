@@ -1,0 +1,92 @@
+"""`docking devices`, `docking monitor`, `--transcript` and wired permissives at a terminal, over real wires."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from docking.cli import call
+from docking.transcript import read_transcript
+from tests.support.dry_cell import CELLS
+from tests.support.program import Terminal, quick_cell, served
+
+pytestmark = [pytest.mark.wires, pytest.mark.timeout(120)]
+
+CRANE_BUSY = """
+schema_version = 1
+name = "the crane is in the way at first"
+
+[[event]]
+at_s = 0.0
+device = "crane_free"
+fault = "drop"
+for_s = 25.0
+"""
+
+
+def told(capsys) -> dict:
+    return json.loads(capsys.readouterr().out)
+
+
+@pytest.mark.parametrize(("name", "count", "skew"), [("lab-can", 14, False), ("lab-modbus", 6, True)])
+def test_every_device_of_a_simulated_cell_answers(name, count, skew, capsys, tmp_path):
+    path = tmp_path / "bytes.txt"
+    assert call(["devices", str(CELLS / f"{name}.toml"), "--sim", "--json", "--transcript", str(path)]) == 0
+    report = told(capsys)
+    assert report["ok"]
+    assert report["missing"] == []
+    assert len(report["devices"]) == count
+    assert all(row["answers"] and row["serial"] and row["round_trip_ms"] > 0.0 for row in report["devices"])
+    assert (report["start_skew_ms"] is not None) is skew
+    lines = read_transcript(path)
+    assert {line.wire.partition(":")[0] for line in lines} == {"tracker", "modbus" if skew else "can"}
+    assert any(line.sent for line in lines)
+    assert any(not line.sent for line in lines)
+
+
+def test_served_devices_are_proved_and_monitored(capsys, tmp_path):
+    cell = CELLS / "lab-can.toml"
+    with served(cell, tmp_path) as wires:
+        there = ["--sim", "--wires", str(wires), "--json"]
+        assert call(["devices", str(cell), *there, "--prove"]) == 0
+        proved = told(capsys)
+        assert proved["bring_up"] is None
+        assert proved["start_skew_ms"] >= 0.0
+        assert call(["monitor", str(cell), *there, "--seconds", "0.3"]) == 0
+        values = told(capsys)
+    assert [row["axis"] for row in values["axes"]][:3] == ["A.X", "A.Y", "A.Z"]
+    assert {row["state"] for row in values["axes"]} == {"switch on disabled"}
+    assert values["inputs"]["crane_free"] is True
+    assert values["inputs"]["e_stop"] is False
+    assert 15.0 < values["temperatures_c"]["component_sensor"] < 25.0
+
+
+def test_a_cell_without_its_devices_is_told_by_name_with_exit_1(capsys, tmp_path):
+    text = (CELLS / "lab-can.toml").read_text().replace("/dev/ttyUSB0", str(tmp_path / "no-port"))
+    cell = tmp_path / "lab-can.toml"
+    cell.write_text(text.replace('interface = "socketcan"', 'interface = "docking-unix"'))
+    assert call(["devices", str(cell), "--json"]) == 1
+    report = told(capsys)
+    assert report["missing"] == ["tracker", "bus"]
+    assert {row["problem"]["code"] for row in report["devices"]} == {1001}
+    assert call(["monitor", str(cell), "--seconds", "0.2"]) == 1
+    assert "1001" in capsys.readouterr().err
+
+
+@pytest.mark.full
+def test_a_wired_permissive_is_waited_for_and_never_asked(tmp_path):
+    cell: Path = quick_cell(tmp_path, "lab-can")
+    scenario = tmp_path / "busy.toml"
+    scenario.write_text(CRANE_BUSY)
+    with (
+        served(cell, tmp_path, "--scenario", str(scenario)) as wires,
+        Terminal("run", str(cell), "--sim", "--wires", str(wires), "--step") as terminal,
+    ):
+        terminal.see("waiting for 'crane_free'")
+        terminal.see("g = .*> \n")
+        terminal.type("a")
+        assert terminal.ended() == 4, terminal.text
+    assert "is 'crane_free' given" not in terminal.text
+    assert terminal.text.count("waiting for 'crane_free'") == 1
