@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from typing import TypeVar, cast
 
@@ -21,54 +20,23 @@ from docking.errors import (
     OutcomeUnknown,
     SegmentRejected,
 )
+from docking.ports import SerialLink
 from docking.types import Array, AxisState, FaultKind, Feedback, Identity, Plan
 from drivers.modbus_client import Tap
+from drivers.modbus_wires import require_line, units_of
 from drivers.path_clocks import PathClock, apart_s
+from drivers.plc_watch import PlcWatch
 from drivers.positioner_plc import ENABLE_S, PositionerPlc, Segments
 from drivers.register_map import load_map
 
 RESERVE_S = 1.0
 """Path time kept in the queues beyond what a stop needs."""
-PUSHES_A_POLL = 4
-PREFILL_TRIES = 10
-LAG_CYCLES = 3
+PUSHES_A_POLL, PREFILL_TRIES = 4, 10
 MISSES = 2
-START_MM = 0.01
-BUSY = 6
+START_MM, BUSY = 0.01, 6
 VERBS = ("run", "hold", "resume", "stop", "quick-stop", "reset")
 T = TypeVar("T")
 _MOVING = ("armed", "running", "held", "done", "enabled")
-
-
-class _Watch:
-    """What the last polls of one PLC showed: lost replies and both heartbeats."""
-
-    def __init__(self, scan_s: float) -> None:
-        self.misses = 0
-        self._scan_s, self._looked_s = scan_s, float("-inf")
-        self._sent: deque[int] = deque(maxlen=LAG_CYCLES)
-        self._alive = -1
-        self._still = 0
-
-    @property
-    def age(self) -> int:
-        """Polls since this PLC last showed anything that is not old."""
-        return self.misses + self._still
-
-    def complaint(self, sent: int, echo: int, alive: int, now_s: float) -> str:
-        """Why the PLC or the link is not alive after this poll; empty when all is well."""
-        oldest = self._sent[0] if len(self._sent) == LAG_CYCLES else echo
-        self._sent.append(sent)
-        if alive != self._alive:
-            self._still, self._alive, self._looked_s = 0, alive, now_s
-        elif now_s - self._looked_s >= 2.0 * self._scan_s:
-            # Two polls in one scan rightly show the same number.
-            self._still, self._looked_s = self._still + 1, now_s
-        if (echo - oldest) & 0x8000:
-            return f"the echo of the heartbeat lags more than {LAG_CYCLES} cycles"
-        if self._still > LAG_CYCLES:
-            return f"the heartbeat of the PLC stood still for {self._still} cycles"
-        return ""
 
 
 def _shown(plc: PositionerPlc) -> AxisState:
@@ -84,26 +52,32 @@ def _shown(plc: PositionerPlc) -> AxisState:
 class ModbusPositioners:
     """All positioners of a cell, one PLC each; construct and use it inside one running loop.
 
-    `addresses` overrides host and port of the cell file by positioner name; `tap` hears all bytes.
+    `addresses` overrides host and port of the cell file by positioner name, `link` its serial line; `tap` hears all
+    bytes of TCP connections.
     """
 
     def __init__(
-        self, cell: CellFile, addresses: Mapping[str, tuple[str, int]] | None = None, tap: Tap | None = None
+        self,
+        cell: CellFile,
+        addresses: Mapping[str, tuple[str, int]] | None = None,
+        tap: Tap | None = None,
+        link: SerialLink | None = None,
     ) -> None:
         if not isinstance(cell.bus, ModbusBus):
             raise BadArgument("bus", "this cell has no Modbus positioners", value=cell.bus.kind)
-        self._cell, self._bus, self._tap = cell, cell.bus, tap
+        self._cell, self._bus, self._tap, self._link = cell, cell.bus, tap, link
         self._driven = np.array(cell.driven)
         self._a_quick = np.array([axis.a_quick_mm_s2 for p in cell.positioners for axis in p.axes])
         self.axes = cell.axis_names
         self.segment_s = self._bus.segment_s
         self._map = load_map(self._bus.map)
+        require_line(self._bus, self._map, len(cell.positioners))
         given = addresses or {}
         self._addresses = {p.name: given.get(p.name, (p.host or "127.0.0.1", p.port or 502)) for p in cell.positioners}
         self._min_fill = math.ceil((0.5 * self._bus.ramp_s + 0.5 * RESERVE_S) / self.segment_s) + 2
         self._depth = math.ceil((0.5 * self._bus.ramp_s + RESERVE_S) / self.segment_s) + 2
         self._plcs: tuple[PositionerPlc, ...] = ()
-        self._watches: tuple[_Watch, ...] = ()
+        self._watches: tuple[PlcWatch, ...] = ()
         self._clocks: tuple[PathClock, ...] = ()
         self._alone = asyncio.Lock()
         self.on_lost: Callable[[], None] = lambda: None
@@ -119,9 +93,14 @@ class ModbusPositioners:
     async def bring_up(self) -> tuple[Identity, ...]:
         """Connect to every PLC, prove identity, scan, settings and strokes; axes stay disabled."""
         self._plcs = tuple(
-            PositionerPlc(p, self._bus, self._map, self._addresses[p.name], self._tap) for p in self._cell.positioners
+            PositionerPlc(p, self._bus, self._map, unit)
+            for p, unit in zip(
+                self._cell.positioners,
+                units_of(self._cell, self._bus, self._addresses, self._tap, self._link),
+                strict=True,
+            )
         )
-        self._watches = tuple(_Watch(self._bus.scan_s) for _ in self._plcs)
+        self._watches = tuple(PlcWatch(self._bus.scan_s) for _ in self._plcs)
         # Two controllers, or one and the host: each off by no more than the cell's clocks are.
         drift = 2e-6 * self._bus.clock_ppm
         self._clocks = tuple(PathClock(self._bus.scan_s, self._bus.ramp_s, drift) for _ in self._plcs)
@@ -272,7 +251,7 @@ class ModbusPositioners:
         """The first PLC with a fault of its own."""
         return next((plc for plc in self._plcs if plc.fault and not plc.comes_after), None)
 
-    async def _cycle(self, plc: PositionerPlc, watch: _Watch) -> None:
+    async def _cycle(self, plc: PositionerPlc, watch: PlcWatch) -> None:
         try:
             if watch.misses:
                 await plc.look()

@@ -25,7 +25,7 @@ from docking.errors import (
     WrongIdentity,
 )
 from docking.types import Identity
-from drivers.modbus_client import ModbusUnit, Tap, tapped
+from drivers.modbus_requests import RegisterUnit
 from drivers.path_clocks import Shown
 from drivers.register_map import RegisterMap
 
@@ -67,20 +67,11 @@ class Segments:
 
 
 class PositionerPlc:
-    """The PLC of one positioner. Construct it inside the running loop. `tap(name, sent, data)` hears all its bytes."""
+    """The PLC of one positioner behind `unit`."""
 
-    def __init__(
-        self,
-        config: PositionerConfig,
-        bus: ModbusBus,
-        layout: RegisterMap,
-        address: tuple[str, int],
-        tap: Tap | None = None,
-    ) -> None:
-        self.config, self._bus, self._map = config, bus, layout
-        self.where = f"positioner {config.name}"
-        self.unit = ModbusUnit(self.where, *address, config.unit or 1, bus.timeout_s)
-        self.unit.tap = tapped(tap, config.name)
+    def __init__(self, config: PositionerConfig, bus: ModbusBus, layout: RegisterMap, unit: RegisterUnit) -> None:
+        self.config, self._bus, self._map, self.unit = config, bus, layout, unit
+        self.where = unit.where
         self.mask = sum(1 << i for i, axis in enumerate(config.axes) if axis.driven)
         self._blocks = layout.blocks
         self._station = crc16(config.name.encode("ascii"))

@@ -14,6 +14,7 @@ from docking.assemble.transcribed import TranscribedDevice, TranscribedStation
 from docking.config import CellFile, JobFile
 from docking.config.cell import CanBus, ModbusBus
 from docking.config.inputs import CanModule, ModbusModule
+from docking.errors import BadArgument
 from docking.transcript import Transcript
 from sim.canopen.group import DriveGroup
 from sim.canopen.io_module import IoModule
@@ -90,6 +91,8 @@ class FarEnd:
 
     async def plcs(self, cell: CellFile, addresses: dict[str, tuple[str, int]] | None) -> dict[str, tuple[str, int]]:
         """Let the positioner PLCs listen; return their addresses."""
+        if cell.bus.kind == "modbus-rtu":
+            raise BadArgument("bus.kind", "PLCs are simulated at TCP addresses only", value=cell.bus.kind)
         names = [p.name for p in cell.positioners]
         skew_s = cell.bus.start_skew_s if isinstance(cell.bus, ModbusBus) else 0.0
         late_s = np.random.default_rng([self.seed, len(names)]).uniform(0.0, skew_s, len(names)).tolist()

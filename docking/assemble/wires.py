@@ -26,7 +26,7 @@ def near_bus(cell: CellFile, found: dict[str, Any]) -> tuple[CanLink | None, Add
     file)."""
     listed = found.get("modbus")
     addresses = {name: (str(host), int(port)) for name, (host, port) in listed.items()} if listed else None
-    if cell.bus.kind == "modbus-tcp":
+    if cell.bus.kind != "canopen":
         return None, addresses
     if "can" in found:
         return CanBusLink("docking-unix", found["can"], cell.bus.bitrate), addresses

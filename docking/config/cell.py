@@ -82,7 +82,7 @@ class DriveScale(Model):
 
 
 class CanBus(Model):
-    kind: Literal["canopen"] = Field(description="twelve or fewer CiA 402 drives in cyclic synchronous position mode")
+    kind: Literal["canopen"] = Field(description="twelve or fewer CiA 402 drives that take one position each cycle")
     interface: str = Field(description="python-can interface name, such as socketcan")
     channel: str = Field(description="python-can channel, such as can0")
     bitrate: Literal[125000, 250000, 500000, 1000000] = Field(default=1000000, description="bit/s")
@@ -111,7 +111,13 @@ class CanBus(Model):
 
 
 class ModbusBus(Model):
-    kind: Literal["modbus-tcp"] = Field(description="positioner PLCs with a segment queue and a common RUN line")
+    kind: Literal["modbus-tcp", "modbus-rtu"] = Field(
+        description="positioner PLCs with a segment queue and a common RUN line, each at an address or all on one line"
+    )
+    line: str | None = Field(default=None, description="modbus-rtu: serial port of all positioners, any pyserial URL")
+    baud: Annotated[int, Field(ge=9600, le=1_000_000)] = Field(
+        default=115200, description="modbus-rtu: speed of the line, 8 data bits, no parity, 1 stop bit, bit/s"
+    )
     segment_s: Annotated[float, Field(ge=0.02, le=0.5)] = Field(
         default=0.1, description="duration of one queued segment, s"
     )
@@ -134,6 +140,12 @@ class ModbusBus(Model):
         default=0.002, description="following error of a healthy axis, divided by its speed, s"
     )
     map: str = Field(default="positioner_plc", description="register map in drivers/maps")
+
+    @model_validator(mode="after")
+    def _line_where_there_is_one(self) -> Self:
+        if (self.kind == "modbus-rtu") != (self.line is not None):
+            raise ValueError("'line' belongs to kind 'modbus-rtu', which needs it")
+        return self
 
 
 class AxisConfig(Model):

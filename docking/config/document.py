@@ -115,6 +115,10 @@ def _addresses(doc: Document) -> list[Finding]:
         ]
         complete = [(key, tuple(p.get(part) for part in ("host", "port", "unit"))) for key, p in found]
         return missing + duplicates(((k, a) for k, a in complete if None not in a and _hashable(a)), "address")
+    if kind == "modbus-rtu":
+        found = [(key, p) for key, p in entries(doc, "positioners[]") if isinstance(p, Mapping)]
+        missing = [error(f"{key}.unit", "missing: its unit on the line") for key, p in found if p.get("unit") is None]
+        return missing + duplicates(entries(doc, "positioners[].unit"), "unit")
     return []
 
 

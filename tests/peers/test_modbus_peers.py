@@ -17,7 +17,7 @@ from docking.errors import BadReply, DeviceRefused, DeviceSilent, PortMissing
 from drivers.modbus_client import ModbusUnit
 from drivers.modbus_positioners import ModbusPositioners
 from tests.support.modbus_cell import START_MM, cell, plan
-from tests.support.real_plcs import simulated_plcs
+from tests.support.real_plcs import LINE_BAUD, simulated_line, simulated_plcs
 
 SETTINGS = ("300", "500", "12", "25", "1500")
 """watchdog_ms, ramp_ms, min_fill, stuck_um, servo_lag_us."""
@@ -106,6 +106,26 @@ async def test_the_driver_moves_the_plcs_over_loopback_in_real_time() -> None:
         assert [identity.serial for identity in identities] == ["SP-A", "SP-B", "SP-C", "SP-D"]
         await driver.enable()
         table = plan(config, 1.5)
+        await driver.load(table)
+        await driver.command("run")
+        async with asyncio.timeout(20.0):
+            feedback = await driver.poll()
+            while not feedback.path_time_s >= table.duration_s:
+                await asyncio.sleep(0.05)
+                feedback = await driver.poll()
+        assert plant.position_mm == pytest.approx(table.q_mm[-1], abs=0.0006)
+        await driver.close()
+        assert plant.braked.all()
+
+
+async def test_the_driver_moves_the_plcs_over_one_serial_line_in_real_time() -> None:
+    async with simulated_line() as (plant, path):
+        line = {"kind": "modbus-rtu", "line": path, "baud": LINE_BAUD, "poll_s": 0.2, "segment_s": 0.2}
+        config = cell(**line, timeout_s=0.5, watchdog_s=1.5)
+        driver = ModbusPositioners(config)
+        await driver.bring_up()
+        await driver.enable()
+        table = plan(config, 1.6)
         await driver.load(table)
         await driver.command("run")
         async with asyncio.timeout(20.0):
