@@ -13,7 +13,7 @@ from drivers.canopen import codec
 from drivers.canopen.identity import DriveProof
 from drivers.canopen.nodes import AxisNode
 from drivers.canopen.sdo import SdoClient
-from drivers.maps.objects import ForceMode, ObjectEntry, ObjectMap, PdoEntry
+from drivers.maps.objects import ForceMode, ObjectEntry, ObjectMap, PdoEntry, PositionMode
 
 _MODE_S = 0.5
 _NO_SUCH_OBJECT = "06020000h"
@@ -68,7 +68,11 @@ class NodeBringUp:
         self._proof = DriveProof(node, bus, omap, self.sdo)
         self._map = omap
         self._holds_force = node.force_n is not None
-        self._mode = omap.force_mode.mode if self._holds_force else omap.mode
+
+    @property
+    def position_mode(self) -> PositionMode:
+        """How the axis takes its set-points; known after `run`."""
+        return self._proof.position_mode
 
     async def run(self, given: dict[str, int]) -> Identity:
         """Prove who answers; write and read back everything.
@@ -77,7 +81,8 @@ class NodeBringUp:
         """
         identity = await self._proof.who()
         await self._proof.scale()
-        for name, value in self._map.written + (self._map.force_mode.written if self._holds_force else ()):
+        of_mode = self._map.force_mode.written if self._holds_force else self.position_mode.written
+        for name, value in self._map.written + of_mode:
             number = given[value[1:]] if isinstance(value, str) else value
             await self._write(self._map.objects[name], number)
         await self._map_pdos()
@@ -103,7 +108,9 @@ class NodeBringUp:
         for communication, cob in self._map.pdos_off:
             await self._switch_off(communication, cob + self.node.node)
         pdos = self._map.pdos
-        await self._map_pdo(pdos["force_set_points" if self._holds_force else "set_points"], self.node.powered)
+        await self._map_pdo(
+            pdos["force_set_points" if self._holds_force else self.position_mode.set_points], self.node.powered
+        )
         await self._map_pdo(pdos["read_back"], True)
         await self._map_pdo(pdos["force"], self.node.load_cell)
 
@@ -141,9 +148,10 @@ class NodeBringUp:
     async def _set_mode(self) -> None:
         """Select the mode and wait until the drive displays it: a write alone proves nothing."""
         objects, loop = self._map.objects, asyncio.get_running_loop()
-        await self._write(objects["mode"], self._mode)
+        mode = self._map.force_mode.mode if self._holds_force else self.position_mode.mode
+        await self._write(objects["mode"], mode)
         deadline = loop.time() + _MODE_S
-        while await self.sdo.read(objects["mode_display"]) != self._mode:
+        while await self.sdo.read(objects["mode_display"]) != mode:
             if not (loop.time() < deadline):
-                await self._confirm(objects["mode_display"], self._mode)
+                await self._confirm(objects["mode_display"], mode)
             await asyncio.sleep(0.02)

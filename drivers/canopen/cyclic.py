@@ -15,7 +15,7 @@ from drivers.canopen.cia402 import DriveState, Goal
 from drivers.canopen.followers import ForceImage
 from drivers.canopen.nodes import AxisNode
 from drivers.canopen.watch import NodeWatch
-from drivers.maps.objects import ObjectMap
+from drivers.maps.objects import ObjectMap, PositionMode
 
 _INT32_MAX = 2147483647.0
 _FRAME = codec.SET_POINT.itemsize
@@ -51,7 +51,8 @@ class CyclicImage:
     def _start_output(self, omap: ObjectMap) -> None:
         self._slots = {int(index): row for row, index in enumerate(self.driven)}
         self._image = np.zeros(len(self.driven), codec.SET_POINT)
-        self._image["mode"] = omap.mode
+        self._image["mode"] = omap.position_modes[0].mode
+        self._enable_bits: NDArray[np.uint16] = np.zeros(len(self.driven), np.uint16)
         self._target = self._image["target"]
         cob = omap.pdos["set_points"].cob
         self.set_point_cobs = [*(cob + self.nodes[int(i)].node for i in self.driven), *self.forces.cobs]
@@ -94,6 +95,13 @@ class CyclicImage:
             self.forces.command(index, controlword)
         elif int(self._image["controlword"][row]) != controlword:
             self._image["controlword"][row] = controlword
+            self._dirty = True
+
+    def choose(self, index: int, mode: PositionMode) -> None:
+        """Set how one axis takes its set-points; nothing for one that holds no position."""
+        row = self._slots.get(index)
+        if row is not None:
+            self._image["mode"][row], self._enable_bits[row] = mode.mode, mode.enable_bits
             self._dirty = True
 
     def command_all(self, controlword: int) -> None:
@@ -141,14 +149,26 @@ class CyclicImage:
         """The frames of this cycle, SYNC last; the list is the caller's to extend only by copying."""
         if self.forces.indices:
             self._lead_forces()
+        if self._enable_bits.any():
+            self._dirty = True
         if self._dirty:
-            raw = self._image.tobytes()
+            raw = self._switched().tobytes()
             cobs = self.set_point_cobs[: len(self.driven)]
             cuts = range(0, len(raw), _FRAME)
             self._frames = [(cob, raw[i : i + _FRAME]) for cob, i in zip(cobs, cuts, strict=True)]
             self._frames += [*self._force_frames, codec.SYNC]
             self._dirty = False
         return self._frames
+
+    def _switched(self) -> NDArray[np.void]:
+        """The image with the bits that a mode wants of an axis once its drive is enabled: an edge that it can see."""
+        if not self._enable_bits.any():
+            return self._image
+        self._decode()
+        image = self._image.copy()
+        on = self._enabled & (image["controlword"] == cia402.ENABLE_OPERATION)
+        image["controlword"] |= np.where(on, self._enable_bits, 0).astype(np.uint16)
+        return image
 
     def _lead_forces(self) -> None:
         """One cycle on for the axes that hold a force."""

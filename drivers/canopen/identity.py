@@ -20,6 +20,7 @@ class DriveProof:
     def __init__(self, node: AxisNode, bus: CanBus, omap: ObjectMap, sdo: SdoClient) -> None:
         self._node, self._bus, self._map, self._sdo = node, bus, omap, sdo
         self._holds_force = node.force_n is not None
+        self.position_mode = omap.position_modes[0]
 
     async def who(self) -> Identity:
         """Prove device profile, vendor, product, revision and serial number, that nobody else answers, and the mode.
@@ -73,16 +74,27 @@ class DriveProof:
                 raise self._mismatch(over, f"{dividend} / {divisor}", f"{wanted:.12g}")
 
     async def _prove_mode(self) -> None:
-        """The drive must have the mode, and for a held force the rated torque that its unit rests on."""
+        """The drive must have a mode of the map, and for a held force the rated torque that its unit rests on.
+
+        `position_mode` is the first that it has.
+        """
         force_mode = self._map.force_mode
         modes = await self._read("supported_modes")
-        bit = force_mode.supported_mode_bit if self._holds_force else self._map.supported_mode_bit
-        if not modes >> bit & 1:
-            mode = force_mode.mode if self._holds_force else self._map.mode
-            cause = f"the drive has no cyclic synchronous {'torque' if self._holds_force else 'position'} mode"
-            raise WrongIdentity(self._node.name, cause, value=f"6502h = {modes:08X}h", limit=f"mode {mode}")
         if self._holds_force:
+            if not modes >> force_mode.supported_mode_bit & 1:
+                raise self._without("cyclic synchronous torque", modes, f"mode {force_mode.mode}")
             self._expect("rated_torque", await self._read("rated_torque"), force_mode.rated_torque_mnm)
+            return
+        known = self._map.position_modes
+        supported = [mode for mode in known if modes >> mode.supported_mode_bit & 1]
+        if not supported:
+            names = " and no ".join(mode.name for mode in known)
+            raise self._without(names, modes, "mode " + " or ".join(str(mode.mode) for mode in known))
+        self.position_mode = supported[0]
+
+    def _without(self, names: str, modes: int, wanted: str) -> WrongIdentity:
+        cause = f"the drive has no {names} mode"
+        return WrongIdentity(self._node.name, cause, value=f"6502h = {modes:08X}h", limit=wanted)
 
     async def _read(self, name: str) -> int:
         return await self._sdo.read(self._map.objects[name])

@@ -231,6 +231,7 @@ class CanopenPositioners:
         identity = await setup.run(quantities(setup.node, self._bus, self._limits, self._map))
         statusword, position = await setup.standing()
         self._image.seed(setup.node.index, statusword, position)
+        self._image.choose(setup.node.index, setup.position_mode)
         return identity
 
     async def _together(self, jobs: Sequence[Coroutine[Any, Any, Identity]]) -> tuple[Identity, ...]:

@@ -46,6 +46,19 @@ class PdoEntry:
 
 
 @dataclass(frozen=True)
+class PositionMode:
+    """One way of following a set-point each cycle: its bit in 6502h, its number for 6060h, the PDO of the set-points,
+    what is added to the controlword once the drive is enabled, what is written besides."""
+
+    name: str
+    supported_mode_bit: int
+    mode: int
+    set_points: str
+    enable_bits: int = 0
+    written: tuple[tuple[str, int | str], ...] = ()
+
+
+@dataclass(frozen=True)
 class ForceMode:
     """How axes that hold a force are set up: mode and its bit in 6502h, the rated torque that the drives must state,
     newtons at the ball in one unit of 6071h and 6072h, way of a revolution; limits in parts of the held force and of
@@ -69,8 +82,7 @@ class ObjectMap:
 
     name: str
     device_profile: int
-    supported_mode_bit: int
-    mode: int
+    position_modes: tuple[PositionMode, ...]
     host_node: int
     host_lost: int
     identity: dict[str, int]
@@ -111,19 +123,23 @@ def _pdo(name: str, raw: dict[str, Any], objects: dict[str, ObjectEntry]) -> Pdo
     return PdoEntry(name, *head, tuple(words), tuple(fields))
 
 
+def _position_mode(raw: dict[str, Any]) -> PositionMode:
+    return PositionMode(**{**raw, "written": tuple(raw.get("written", {}).items())})
+
+
 def parse_object_map(raw: dict[str, Any]) -> ObjectMap:
     """Build an object map from its parsed TOML; KeyError or TypeError where the data is not of this form."""
     objects = {name: ObjectEntry(name, **entry) for name, entry in raw["objects"].items()}
     force_mode = dict(raw["force_mode"])
     force_written: dict[str, int | str] = force_mode.pop("written")
-    unknown = [name for name in (*raw["written"], *raw["proved"], *force_written) if name not in objects]
+    of_modes = [name for mode in raw["position_modes"] for name in mode.get("written", {})]
+    unknown = [name for name in (*raw["written"], *raw["proved"], *force_written, *of_modes) if name not in objects]
     if unknown or any(entry.type not in _BITS for entry in objects.values()):
         raise KeyError(f"unknown object or type {unknown}")
     return ObjectMap(
         name=raw["name"],
         device_profile=raw["device_profile"],
-        supported_mode_bit=raw["supported_mode_bit"],
-        mode=raw["mode"],
+        position_modes=tuple(_position_mode(entry) for entry in raw["position_modes"]),
         host_node=raw["host_node"],
         host_lost=raw["host_lost"],
         identity=dict(raw["identity"]),

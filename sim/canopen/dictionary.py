@@ -11,10 +11,11 @@ from sim.canopen.settings import DriveSettings
 
 INVALID: Final = 0x8000_0000
 CYCLIC_RPDO: Final = (0x6040_0010, 0x607A_0020, 0x6060_0008)
+INTERPOLATION_RPDO: Final = (0x6040_0010, 0x60C1_0120, 0x6060_0008)
 FORCE_RPDO: Final = (0x6040_0010, 0x6071_0010, 0x6060_0008)
 CYCLIC_TPDO: Final = (0x6041_0010, 0x6064_0020, 0x60F4_0010)
 FORCE_TPDO: Final = (0x2100_0110,)
-_LAYOUTS: Final = {0x1600: (CYCLIC_RPDO, FORCE_RPDO), 0x1A00: (CYCLIC_TPDO,), 0x1A01: (FORCE_TPDO,)}
+_LAYOUTS: Final = {0x1600: (CYCLIC_RPDO, INTERPOLATION_RPDO, FORCE_RPDO), 0x1A00: (CYCLIC_TPDO,), 0x1A01: (FORCE_TPDO,)}
 _FACTORY: Final = {
     0x1400: (0x200, (0x6040_0010,)),
     0x1401: (0x300, (0x6040_0010, 0x6060_0008)),
@@ -94,7 +95,7 @@ class Dictionary:
         self.deaf: set[tuple[int, int]] = set()
         self.lies: dict[tuple[int, int], int] = {}
         self._live, self._changed, self._operational = live, changed, operational
-        self._entries: dict[tuple[int, int], Entry] = {**_identity(node, settings), **_drive(), **_pdos(node)}
+        self._entries: dict[tuple[int, int], Entry] = {**_identity(node, settings), **_drive(settings), **_pdos(node)}
 
     def number(self, index: int, sub: int = 0) -> int:
         """An integer object's stored or live value. Raises Abort."""
@@ -195,7 +196,7 @@ def _identity(node: int, settings: DriveSettings) -> dict[tuple[int, int], Entry
     }
 
 
-def _drive() -> dict[tuple[int, int], Entry]:
+def _drive(settings: DriveSettings) -> dict[tuple[int, int], Entry]:
     return {
         (0x2100, 0): Entry("B", 1),
         (0x2100, 1): Entry("h", 0),
@@ -230,11 +231,14 @@ def _drive() -> dict[tuple[int, int], Entry]:
         (0x6092, 0): Entry("B", 2),
         (0x6092, 1): Entry("I", 0),
         (0x6092, 2): Entry("I", 1),
+        (0x60C0, 0): Entry("h", 0, True, 0, 0),
+        (0x60C1, 0): Entry("B", 1),
+        (0x60C1, 1): Entry("i", 0, True),
         (0x60C2, 0): Entry("B", 2),
         (0x60C2, 1): Entry("B", 20, True, 1),
         (0x60C2, 2): Entry("b", -3, True, -6, 0),
         (0x60F4, 0): Entry("i", 0),
-        (0x6502, 0): Entry("I", 1 << 7 | 1 << 9),
+        (0x6502, 0): Entry("I", settings.supported_modes),
     }
 
 

@@ -17,6 +17,7 @@ from docking.types import Array
 from sim.canopen.parameters import BoolArray, ForceTargets, Parameters
 from sim.canopen.settings import DriveSettings
 
+IP: Final = 7
 CSP: Final = 8
 CST: Final = 10
 FOLLOWING_ERROR: Final = 0x8611
@@ -24,6 +25,7 @@ HOST_LOST: Final = 0x8130
 SYNC_LOST: Final = 0x8700
 
 _FOLLOWS, _WINDOW, _BRAKE, _LIMIT = 1 << 12, 1 << 13, 1 << 14, 1 << 11
+_INTERPOLATE = 1 << 4
 _REMOTE_AND_VOLTAGE = 1 << 9 | 1 << 4
 
 
@@ -161,6 +163,8 @@ class Drives:
             self.quick_stop(index, t_s)
         elif target is not None:
             self._enter(index, target, t_s)
+        elif self.modes[index] == IP and not word & _INTERPOLATE and self.following[index]:
+            self._rest(index)
 
     def stop_by_itself(self, index: int, t_s: float) -> None:
         """Ramp one enabled axis down for a reason of the drive's own."""
@@ -290,10 +294,21 @@ class Drives:
     def _begin_following(self, index: int) -> None:
         if self.braked[index] or index in self._brake_due:
             return
-        if self.modes[index] == CSP:
+        mode = self.modes[index]
+        if not mode or not self._settings.supported_modes >> (mode - 1) & 1:
+            return
+        if mode == CSP or (mode == IP and self.controlwords[index] & _INTERPOLATE):
             self.following[index] = True
-        elif self.modes[index] == CST:
+        elif mode == CST:
             self.forces.take(index)
+        self._report(index)
+
+    def _rest(self, index: int) -> None:
+        """Interpolation was switched off: the axis holds its last point."""
+        self.following[index] = False
+        self._goal = self._goal.copy()
+        self._goal[index] = self._now[index]
+        self.busy = True
         self._report(index)
 
     def _ramp(self, index: int, dt_s: float, now_mm: float) -> float:

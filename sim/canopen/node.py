@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final, Protocol
 
-from sim.canopen.dictionary import CYCLIC_RPDO, CYCLIC_TPDO, FORCE_RPDO, FORCE_TPDO, Dictionary
+from sim.canopen.dictionary import CYCLIC_RPDO, CYCLIC_TPDO, FORCE_RPDO, FORCE_TPDO, INTERPOLATION_RPDO, Dictionary
 from sim.canopen.sdo_server import SdoServer
 from sim.canopen.settings import DriveSettings
 from sim.wires.can_frames import CanFrame
@@ -67,7 +67,8 @@ class Node:
 
     @property
     def takes_set_points(self) -> bool:
-        return self.state == OPERATIONAL and self.dictionary.mapped(0x1400, CYCLIC_RPDO)
+        layouts = (CYCLIC_RPDO, INTERPOLATION_RPDO)
+        return self.state == OPERATIONAL and any(self.dictionary.mapped(0x1400, layout) for layout in layouts)
 
     @property
     def takes_forces(self) -> bool:

@@ -29,6 +29,8 @@ class DriveSettings:
     vendor: int = 0x0000_05D0
     product: int = 0x0402_0008
     revision: int = 0x0001_0003
+    supported_modes: int = 1 << 7 | 1 << 9
+    """6502h: bit n - 1 is mode n. The drives know 7 (interpolated), 8 (cyclic position) and 10 (cyclic torque)."""
     first_serial: int = 402_000
     """Serial number of node n is `first_serial` + n."""
 

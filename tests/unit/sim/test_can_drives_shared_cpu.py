@@ -81,7 +81,7 @@ def test_a_controller_that_stops_is_noticed_after_the_stated_cycles(cycles: floa
         assert all(stage is Stage.OPERATION for stage in bench.drives.drives.stages)
         await asyncio.sleep(0.03)
         assert all(stage is Stage.QUICK_STOP for stage in bench.drives.drives.stages)
-        assert bench.master._watch.first is not None
-        assert bench.master._watch.first[1] == SYNC_LOST
+        assert bench.master._watch.worst is not None
+        assert bench.master._watch.worst[1] == SYNC_LOST
 
     run(scenario, shared_cpu=True, sync_loss="quick-stop", sync_loss_cycles=cycles)
