@@ -159,7 +159,7 @@ class ModbusTcpConnection(asyncio.Protocol):
             if end > len(buffer):
                 break
             device = self._units.get(unit)
-            if not isinstance(device, ContactDevice) or device.answers:
+            if getattr(device, "answers", True):
                 reply = answer(self._units, unit, function, buffer[at + 8 : end])
                 replies.append(struct.pack(">HHHB", transaction, 0, len(reply) + 1, unit) + reply)
             at = end
