@@ -191,7 +191,7 @@ class CanIoModule:
             self._fall_silent()
 
     def _on_lost(self, reason: str) -> None:
-        self._fall_silent()
+        """The refresh time runs out: axes on the same wire tell first that it is gone."""
 
     def _fall_silent(self) -> None:
         if not self._silent:
