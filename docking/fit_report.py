@@ -2,15 +2,101 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import degrees
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-from docking.errors import BadArgument, PoseError
-from docking.geometry import matrix_to_euler
+import numpy as np
+
+from docking.errors import PoseError
+from docking.fit_options import FitOptions, expansion_from, prepared, settings_from
+from docking.geometry import matrix_to_euler, skew
 from docking.point_file import read_points
-from docking.pose import METHODS, FitSettings, Method, fit_pose, screen
-from docking.types import Fit, Pose, Rejection
+from docking.pose import fit_pose, screen
+from docking.pose.locks import turning_axes
+from docking.pose.quantiles import chi2_tail
+from docking.types import Array, Fit, Points, Pose, Rejection, Screened
+
+SIGMAS = ("alpha_deg", "beta_deg", "gamma_deg", "x_mm", "y_mm", "z_mm")
+_EMPTY: dict[str, Any] = {
+    "pose": None,
+    "rms_mm": None,
+    "max_mm": None,
+    "used": [],
+    "rejected": [],
+    "dropped_readings": [],
+    "residuals_mm": {},
+    "refused": None,
+    "method": None,
+    "covariance": None,
+    "sigma": None,
+    "chi2": None,
+    "dof": None,
+    "chi2_p": None,
+    "redundancy": None,
+    "scale": None,
+    "swapped": {},
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult:
+    """What came of one `docking fit`: the fit and its points, or the refusal. `given` is the stated expansion,
+    `sigmas_known` whether every point's covariance was stated."""
+
+    nominal: Points
+    fit: Fit | None
+    screened: Screened | None
+    refusal: PoseError | None
+    given: float
+    sigmas_known: bool
+
+
+def run_fit(nominal_path: str | Path, measured_path: str | Path, options: FitOptions | None = None) -> FitResult:
+    """Screen and fit MEASURED to NOMINAL. Raises FileUnreadable, BadPointFile, BadArgument."""
+    options = FitOptions() if options is None else options
+    nominal = read_points(Path(nominal_path), "nominal")
+    measured = read_points(Path(measured_path), "measured")
+    settings = settings_from(options, nominal, measured)
+    nominal, measured = prepared(options, nominal, measured)
+    known = bool(np.all(np.isfinite(nominal.cov_mm2)) and np.all(np.isfinite(measured.cov_mm2)))
+    given = expansion_from(options.temperature)
+    try:
+        screened = screen(nominal, measured, settings)
+        return FitResult(nominal, fit_pose(screened, settings), screened, None, given, known)
+    except PoseError as refusal:
+        return FitResult(nominal, None, None, refusal, given, known)
+
+
+def fit_files(nominal_path: str | Path, measured_path: str | Path, method: str = "ml") -> dict[str, Any]:
+    """Screen and fit MEASURED to NOMINAL with no options but the method; the JSON object of `docking fit`."""
+    return fit_json(run_fit(nominal_path, measured_path, FitOptions(method=method)))
+
+
+def centroid_cov(fit: Fit, centroid_M_mm: Array) -> Array:
+    """Covariance (6, 6) of [rotation vector in rad about the axes of M, translation in mm of a point (3,) in M]."""
+    arm = centroid_M_mm - fit.pivot_mm
+    jac = np.eye(6, 7)
+    jac[3:, :3], jac[3:, 6] = -skew(arm), arm
+    result: Array = jac @ fit.whole_cov() @ jac.T
+    return result
+
+
+def pose_sigmas(fit: Fit) -> dict[str, float | None]:
+    """1 sigma of [Luo]'s six numbers; in gimbal lock alpha and gamma are not told apart and have none."""
+    e = matrix_to_euler(fit.X_MN.R)
+    jac = np.eye(6)
+    jac[3:, :3] = -skew(fit.X_MN.t_mm - fit.pivot_mm)
+    if not e.gimbal_lock:
+        jac[:3, :3] = np.linalg.inv(turning_axes(e.beta_rad, e.gamma_rad))
+    else:
+        jac[1, :3] = turning_axes(e.beta_rad, e.gamma_rad)[:, 1]
+    sigma = np.sqrt(np.maximum(np.diag(jac @ fit.cov @ jac.T), 0.0))
+    values: list[float | None] = [*np.degrees(sigma[:3]).tolist(), *sigma[3:].tolist()]
+    if e.gimbal_lock:
+        values[0] = values[2] = None
+    return dict(zip(SIGMAS, values, strict=True))
 
 
 def _pose_json(X: Pose) -> dict[str, Any]:
@@ -28,54 +114,42 @@ def _pose_json(X: Pose) -> dict[str, Any]:
     }
 
 
-def _rejected_json(rejected: tuple[Rejection, ...]) -> list[dict[str, str]]:
-    return [{"name": r.name, "reason": r.reason, "detail": r.detail} for r in rejected]
+def _rejected_json(rejected: tuple[Rejection, ...]) -> dict[str, Any]:
+    rows = [{"name": r.name, "reason": r.reason, "detail": r.detail} for r in rejected]
+    return {"rejected": rows, "swapped": {r.name: r.partner for r in rejected if r.partner}}
 
 
-def _fitted(fit: Fit, dropped: tuple[Rejection, ...]) -> dict[str, Any]:
-    residuals = {n: [float(v) for v in r] for n, r in zip(fit.names, fit.residuals_mm, strict=True)}
+def fit_json(result: FitResult) -> dict[str, Any]:
+    """The JSON object of `docking fit`; every key is always there.
+
+    `pose` is X_MN (nominal into measured coordinates); `residuals_mm` measured minus fitted, passes averaged; `used`
+    and `rejected` name the points; `dropped_readings` are single passes left out of a used point; `refused` is the
+    reason why no pose is given, else null. `covariance`: see `centroid_cov`, the centroid is that of the used points.
+    `chi2_p` is null where the sigmas were taken from the residuals themselves, or the method does not use them.
+    """
+    fit, screened = result.fit, result.screened
+    if fit is None or screened is None:
+        assert result.refusal is not None
+        return {**_EMPTY, **_rejected_json(result.refusal.rejected), "refused": result.refusal.text()}
+    judged = result.sigmas_known and fit.method == "ml"
     return {
+        **_EMPTY,
         "pose": _pose_json(fit.X_MN),
         "rms_mm": fit.rms_mm,
         "max_mm": fit.max_mm,
         "used": list(fit.names),
-        "rejected": _rejected_json(fit.rejected),
-        "dropped_readings": _rejected_json(dropped),
-        "residuals_mm": residuals,
-        "refused": None,
+        **_rejected_json(fit.rejected),
+        "dropped_readings": _rejected_json(screened.dropped)["rejected"],
+        "residuals_mm": {n: [float(v) for v in r] for n, r in zip(fit.names, fit.residuals_mm, strict=True)},
+        "method": fit.method,
+        "covariance": centroid_cov(fit, screened.measured_mm.mean(axis=0)).tolist(),
+        "sigma": pose_sigmas(fit),
+        "chi2": fit.chi2,
+        "dof": fit.dof,
+        "chi2_p": chi2_tail(fit.chi2, fit.dof) if judged else None,
+        "redundancy": fit.redundancy,
+        "scale": (1.0 + result.given) * (1.0 + fit.expansion),
     }
-
-
-def _refused(error: PoseError) -> dict[str, Any]:
-    return {
-        "pose": None,
-        "rms_mm": None,
-        "max_mm": None,
-        "used": [],
-        "rejected": _rejected_json(error.rejected),
-        "dropped_readings": [],
-        "residuals_mm": {},
-        "refused": error.text(),
-    }
-
-
-def fit_files(nominal_path: str | Path, measured_path: str | Path, method: str = "ml") -> dict[str, Any]:
-    """Screen and fit MEASURED to NOMINAL; the JSON object of `docking fit`.
-
-    `pose` is X_MN (nominal into measured coordinates); `residuals_mm` measured minus fitted, passes averaged;
-    `used` and `rejected` name the points; `dropped_readings` are single passes left out of a used point; `refused`
-    is the reason why no pose is given, else null. Raises FileUnreadable, BadPointFile, BadArgument.
-    """
-    if method not in METHODS:
-        raise BadArgument("--method", f"choose one of {', '.join(METHODS)}", value=method)
-    nominal = read_points(Path(nominal_path), "nominal")
-    measured = read_points(Path(measured_path), "measured")
-    settings = FitSettings(method=cast(Method, method), where="fit")
-    try:
-        screened = screen(nominal, measured, settings)
-        return _fitted(fit_pose(screened, settings), screened.dropped)
-    except PoseError as error:
-        return _refused(error)
 
 
 def _rejected_lines(title: str, rejected: list[dict[str, str]]) -> list[str]:
@@ -83,8 +157,32 @@ def _rejected_lines(title: str, rejected: list[dict[str, str]]) -> list[str]:
     return lines + [f"  {r['name']:<16} {r['reason']:<16} {r['detail']}" for r in rejected]
 
 
+def _plus_minus(sigma: dict[str, float | None], name: str, digits: int) -> str:
+    value = sigma[name]
+    return "not told apart" if value is None else f"{value:.{digits}f}"
+
+
+def judgement_lines(result: dict[str, Any]) -> list[str]:
+    """How far the pose is known and whether the residuals are what the sigmas let expect, for a person."""
+    sigma = result["sigma"]
+    lines = [
+        "one sigma: "
+        + "  ".join(f"{name[0]} {_plus_minus(sigma, name, 4)}" for name in SIGMAS[3:])
+        + " mm  "
+        + "  ".join(f"{name.partition('_')[0]} {_plus_minus(sigma, name, 6)}" for name in SIGMAS[:3])
+        + " deg"
+    ]
+    if result["chi2_p"] is not None:
+        lines.append(f"chi2 {result['chi2']:.1f} for {result['dof']} degrees of freedom (p = {result['chi2_p']:.3g})")
+    if result["redundancy"] == 0:
+        lines.append("NO REDUNDANCY: three points define a pose, nothing in the fit could prove it wrong")
+    if result["scale"] != 1.0:
+        lines.append(f"scale of the nominal: {result['scale']:.8f}")
+    return lines
+
+
 def fit_text(result: dict[str, Any]) -> str:
-    """The result of `fit_files` for a person."""
+    """The result of `fit_json` for a person."""
     tail = _rejected_lines("rejected points", result["rejected"])
     tail += _rejected_lines("readings left out", result["dropped_readings"])
     if result["refused"] is not None:
@@ -94,6 +192,7 @@ def fit_text(result: dict[str, Any]) -> str:
         "pose of the nominal in the measured frame, R = Rz(gamma) Ry(beta) Rx(alpha)",
         f"  x {pose['x_mm']:.4f}  y {pose['y_mm']:.4f}  z {pose['z_mm']:.4f} mm",
         f"  alpha {pose['alpha_deg']:.6f}  beta {pose['beta_deg']:.6f}  gamma {pose['gamma_deg']:.6f} deg",
+        *judgement_lines(result),
         f"{len(result['used'])} points used, residuals: rms {result['rms_mm']:.4f}, largest {result['max_mm']:.4f} mm",
     ]
     for name, r in result["residuals_mm"].items():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +10,8 @@ import numpy as np
 from docking.calibration.network import Network, View, adjust_network
 from docking.errors import BadArgument, SigmaMissing
 from docking.geometry import pose_to_vector
-from docking.noise_spec import CovarianceOf, noise_from
+from docking.noise_spec import noise_from, with_noise
 from docking.point_file import read_points
-from docking.pose.passes import lost_beam
 from docking.pose.uncertainty import largest_sigma_mm
 from docking.records import POSE_KEYS, rejection_records
 from docking.types import Array, Points
@@ -29,18 +27,9 @@ def network_of(files: tuple[Path, ...], ers: Path | None, noise: str) -> Network
         raise BadArgument("FILES", f"two stations are called {twice[0]}", value=" ".join(map(str, files)))
     of = noise_from(noise)
     views = tuple(
-        View(name, _with_noise(read_points(path, "measured"), of)) for name, path in zip(names, files, strict=True)
+        View(name, with_noise(read_points(path, "measured"), of)) for name, path in zip(names, files, strict=True)
     )
     return adjust_network(views, None if ers is None else _references(ers))
-
-
-def _with_noise(points: Points, of: CovarianceOf) -> Points:
-    """Readings with the instrument's covariance where the file gives none; lost beams keep theirs."""
-    cov = np.array(points.cov_mm2)
-    for i in np.flatnonzero(~np.all(np.isfinite(cov), axis=(1, 2))):
-        if not lost_beam(points.xyz_mm[i]):
-            cov[i] = of(points.xyz_mm[i : i + 1])[0]
-    return replace(points, cov_mm2=cov)
 
 
 def _references(path: Path) -> Points:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from docking.errors import BadArgument
 from docking.pose.noise import NOISE_PRESETS
-from docking.types import Array
+from docking.pose.passes import lost_beam
+from docking.types import Array, Points
 
 CovarianceOf = Callable[[Array], Array]
 """Covariances (n, 3, 3) in mm^2 of readings at points (n, 3) of the measured frame."""
@@ -34,6 +36,15 @@ def noise_from(spec: str, where: str = "--noise") -> CovarianceOf:
         return lambda points: model.covariance(points - station)
     forms = ", ".join(["iso:MM", *(f"{name}[:X,Y,Z]" for name in _INSTRUMENTS)])
     raise BadArgument(where, f"one of {forms} is needed, in mm", value=spec)
+
+
+def with_noise(points: Points, of: CovarianceOf) -> Points:
+    """Readings with the instrument's covariance where they have none; lost beams keep theirs."""
+    cov = np.array(points.cov_mm2)
+    for i in np.flatnonzero(~np.all(np.isfinite(cov), axis=(1, 2))):
+        if not lost_beam(points.xyz_mm[i]):
+            cov[i] = of(points.xyz_mm[i : i + 1])[0]
+    return replace(points, cov_mm2=cov)
 
 
 def _number(text: str) -> float:

@@ -135,7 +135,7 @@ def average_passes(points: Points, settings: FitSettings) -> Averaged:
 
 
 def _single_readings(points: Points) -> Averaged:
-    """What `average_passes` gives when every point has one reading: nothing to compare, only lost beams to leave out."""
+    """`average_passes` where every point has one reading: nothing to compare, only lost beams to leave out."""
     result = Averaged()
     seen = np.all(np.isfinite(points.xyz_mm), axis=1) & np.any(points.xyz_mm != 0.0, axis=1)
     for name, xyz, cov, good in zip(points.names, points.xyz_mm, points.cov_mm2, seen, strict=True):

@@ -53,14 +53,25 @@ def screen(nominal: Points, measured: Points, settings: FitSettings | None = Non
     """
     settings = FitSettings() if settings is None else settings
     averaged = Averaged()
+    excluded = [Rejection(name, "excluded", "left out as asked") for name in settings.excluded]
     try:
+        nominal, measured = (_without(points, settings.excluded) for points in (nominal, measured))
         averaged = average_passes(measured, settings)
-        averaged.rejected += _unmatched(nominal, measured)
+        averaged.rejected += [*_unmatched(nominal, measured), *excluded]
         pairs = _matched(nominal, averaged)
         return _screen_pairs(pairs, averaged, settings)
     except PoseError as error:
         error.rejected = (*error.rejected, *averaged.rejected)
         raise
+
+
+def _without(points: Points, names: tuple[str, ...]) -> Points:
+    """The rows of other names."""
+    if not names:
+        return points
+    keep = [i for i, name in enumerate(points.names) if name not in names]
+    passes = tuple(points.passes[i] for i in keep) if points.passes else ()
+    return Points(tuple(points.names[i] for i in keep), points.xyz_mm[keep], points.cov_mm2[keep], passes)
 
 
 def _unmatched(nominal: Points, measured: Points) -> list[Rejection]:
@@ -77,7 +88,7 @@ def _matched(nominal: Points, averaged: Averaged) -> Pairs:
     j = [nominal.names.index(name) for name in names]
     i = [row[name] for name in names]
     known = set(nominal.names)
-    averaged.rejected[:] = [r for r in averaged.rejected if r.name in known or r.reason == "unmatched"]
+    averaged.rejected[:] = [r for r in averaged.rejected if r.name in known or r.reason in ("unmatched", "excluded")]
     xyz = np.array([averaged.xyz_mm[k] for k in i]).reshape(-1, 3)
     cov = np.array([averaged.cov_mm2[k] for k in i]).reshape(-1, 3, 3)
     return Pairs(names, nominal.xyz_mm[j].reshape(-1, 3), xyz, nominal.cov_mm2[j].reshape(-1, 3, 3), cov)

@@ -20,6 +20,7 @@ from docking.pose.uncertainty import total_cov_mm2
 from docking.types import Array
 
 _ROUNDS = 40
+_LEAST_SCALED = 4
 
 
 class Pairs(NamedTuple):
@@ -116,16 +117,17 @@ def snoop(pairs: Pairs, kept: list[int], settings: FitSettings, scaled: bool) ->
     """Move points in or out of the kept set, the clearest case first, until all agree with the test.
 
     `scaled`: the covariances are known up to a factor only. A point once put out by the test stays out, and no point is
-    put out when fewer than `settings.min_agreeing` would remain.
+    put out when fewer than `settings.min_agreeing` would remain, or fewer than four where they also tell the factor.
     """
     kept, banned = sorted(kept), set[int]()
+    least = max(settings.min_agreeing, _LEAST_SCALED) if scaled else settings.min_agreeing
     for _ in range(_ROUNDS):
         solution = solve(pairs.rows(kept), settings.expansion_sigma)
         ratio = _ratio(pairs, kept, _statistics(pairs, solution, kept), settings.false_alarm, scaled)
         worst = max(kept, key=lambda i: ratio[i])
         outside = [i for i in range(len(ratio)) if i not in kept and i not in banned]
         nearest = min(outside, key=lambda i: ratio[i], default=None)
-        if ratio[worst] > 1.0 and len(kept) > settings.min_agreeing:
+        if ratio[worst] > 1.0 and len(kept) > least:
             kept.remove(worst)
             banned.add(worst)
         elif nearest is not None and ratio[nearest] <= 1.0:

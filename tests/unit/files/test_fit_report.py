@@ -18,7 +18,10 @@ J = np.array(
     [[0, 0, 0.5], [3000, 100, 0], [2900, 1500, 200], [-100, 1600, 1000], [1500, 700, 1900], [200, 900, -800.0]]
 )
 VECTOR = [100.0, -200.0, 300.0, 1.0, -2.0, 30.0]
-KEYS = {"pose", "rms_mm", "max_mm", "used", "rejected", "dropped_readings", "residuals_mm", "refused"}
+KEYS = {
+    "pose", "rms_mm", "max_mm", "used", "rejected", "dropped_readings", "residuals_mm", "refused",
+    "method", "covariance", "sigma", "chi2", "dof", "chi2_p", "redundancy", "scale", "swapped",
+}  # fmt: skip
 
 
 def write(path: Path, names: str, xyz: np.ndarray) -> Path:
@@ -27,7 +30,7 @@ def write(path: Path, names: str, xyz: np.ndarray) -> Path:
     return path
 
 
-@pytest.mark.parametrize("method", ["svd", "three-point", "least-squares"])
+@pytest.mark.parametrize("method", ["ml", "svd", "three-point", "least-squares"])
 def test_pose_takes_nominal_into_measured(tmp_path: Path, method: str) -> None:
     p = pose_from_vector(VECTOR).apply(J)
     result = fit_files(write(tmp_path / "n.csv", "ABCDEF", J), write(tmp_path / "m.csv", "FEDCBA", p[::-1]), method)
