@@ -53,6 +53,7 @@ class CyclicImage:
         self._image = np.zeros(len(self.driven), codec.SET_POINT)
         self._image["mode"] = omap.position_modes[0].mode
         self._enable_bits: NDArray[np.uint16] = np.zeros(len(self.driven), np.uint16)
+        self._switching = False
         self._target = self._image["target"]
         cob = omap.pdos["set_points"].cob
         self.set_point_cobs = [*(cob + self.nodes[int(i)].node for i in self.driven), *self.forces.cobs]
@@ -102,7 +103,7 @@ class CyclicImage:
         row = self._slots.get(index)
         if row is not None:
             self._image["mode"][row], self._enable_bits[row] = mode.mode, mode.enable_bits
-            self._dirty = True
+            self._switching, self._dirty = bool(self._enable_bits.any()), True
 
     def command_all(self, controlword: int) -> None:
         """Set the controlword of every powered axis."""
@@ -149,10 +150,8 @@ class CyclicImage:
         """The frames of this cycle, SYNC last; the list is the caller's to extend only by copying."""
         if self.forces.indices:
             self._lead_forces()
-        if self._enable_bits.any():
-            self._dirty = True
-        if self._dirty:
-            raw = self._switched().tobytes()
+        if self._dirty or self._switching:
+            raw = (self._switched() if self._switching else self._image).tobytes()
             cobs = self.set_point_cobs[: len(self.driven)]
             cuts = range(0, len(raw), _FRAME)
             self._frames = [(cob, raw[i : i + _FRAME]) for cob, i in zip(cobs, cuts, strict=True)]
@@ -162,8 +161,6 @@ class CyclicImage:
 
     def _switched(self) -> NDArray[np.void]:
         """The image with the bits that a mode wants of an axis once its drive is enabled: an edge that it can see."""
-        if not self._enable_bits.any():
-            return self._image
         self._decode()
         image = self._image.copy()
         on = self._enabled & (image["controlword"] == cia402.ENABLE_OPERATION)

@@ -25,10 +25,10 @@ STARTING_VALUES = {(0x6041, 0), (0x6064, 0)}
 """Where the axis stands now; the first read-back frame replaces them."""
 
 
-def two_stations() -> CellFile:
-    """The positioner that holds positions and the one that holds the force: six nodes with all kinds of axes."""
+def station_of(kind: str) -> CellFile:
+    """The positioner with this liar alone: three nodes."""
     cell = can_cell("follower-force-can")
-    return cell.model_copy(update={"positioners": (cell.positioners[0], cell.positioners[3])})
+    return cell.model_copy(update={"positioners": tuple(p for p in cell.positioners if p.name == LIARS[kind][0])})
 
 
 def reads_of(trace: list[tuple[int, bytes]], node: int) -> list[Address]:
@@ -42,14 +42,14 @@ def seen_reads() -> dict[str, dict[Address, int]]:
     found: dict[str, dict[Address, int]] = {}
 
     async def main() -> None:
-        bench = Bench(two_stations())
-        bench.watch()
-        await bench.master.bring_up()
         for kind, axis in LIARS.items():
+            bench = Bench(station_of(kind))
+            bench.watch()
+            await bench.master.bring_up()
             node = bench.drives.nodes[bench.cell.axis_names.index(axis)]
             addresses = [a for a in reads_of(bench.trace, node.number) if a not in TOLD_ONLY | STARTING_VALUES]
             found[kind] = {address: node.number_of(*address) for address in addresses}
-        bench.drives.close()
+            bench.drives.close()
 
     run_virtual(main)
     return found
@@ -85,7 +85,7 @@ def marks(kind: str, address: Address, bit: int) -> list[pytest.MarkDecorator]:
 )
 def test_a_drive_that_lies_about_one_object_is_refused_by_name(kind: str, address: Address, bit: int) -> None:
     async def main() -> None:
-        bench = Bench(two_stations())
+        bench = Bench(station_of(kind))
         index, sub = address
         bench.drives.faults.lie(LIARS[kind], index, READS[kind][address] ^ 1 << bit, sub)
         with pytest.raises(LinkError) as caught:
