@@ -11,6 +11,9 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 LINE_MAX = 200
 SEQ_MODULUS = 65536
 
@@ -29,10 +32,31 @@ def _crc_table() -> tuple[int, ...]:
 
 
 _TABLE = _crc_table()
+_SHARED_MAX = 256
+
+
+def _share_tables() -> tuple[NDArray[np.uint16], list[NDArray[np.intp]]]:
+    """What a byte adds to the register by its distance from the end, and where that stands for each length of data."""
+    table = np.array(_TABLE, dtype=np.uint16)
+    rows = [table]
+    for _ in range(_SHARED_MAX - 1):
+        rows.append((rows[-1] >> 8) ^ table[rows[-1] & 0xFF])
+    starts = np.arange(_SHARED_MAX, dtype=np.intp) * 256
+    return np.concatenate(rows[::-1]), [starts[_SHARED_MAX - length :] for length in range(_SHARED_MAX + 1)]
+
+
+_SHARES, _STARTS = _share_tables()
 
 
 def crc16_arc(data: bytes) -> int:
-    """CRC-16/ARC: polynomial 0x8005 reflected, start 0, no final xor; 0xBB3D over b"123456789"."""
+    """CRC-16/ARC: polynomial 0x8005 reflected, start 0, no final xor; 0xBB3D over b"123456789".
+
+    With start 0 the sum is linear: the shares of the single bytes are looked up at once, which for lines of the usual
+    length is faster than byte after byte.
+    """
+    if len(data) <= _SHARED_MAX:
+        places = np.frombuffer(data, dtype=np.uint8) + _STARTS[len(data)]
+        return int(np.bitwise_xor.reduce(_SHARES.take(places)))
     crc = 0
     for byte in data:
         crc = (crc >> 8) ^ _TABLE[(crc ^ byte) & 0xFF]

@@ -1,8 +1,8 @@
 """A serial line inside the process: `near` is the host's `docking.ports.SerialLink`, `far` belongs to the device.
 
 Both directions are paced at the baud rate with one timer a chunk, so an exchange takes the wire time of its bytes on
-the loop's clock. `unplug` makes the port vanish as a pulled cable does; `missing` lets `open` fail. Each end has a speed
-of its own; while they differ, both receive garbage.
+the loop's clock. `unplug` makes the port vanish as a pulled cable does; `missing` lets `open` fail. Each end has its
+own speed; while the two differ, both receive garbage.
 """
 
 from __future__ import annotations

@@ -66,11 +66,11 @@ def _readline(lines: list[bytes]) -> None:
     """What a first driver does: open the port, readline. Nothing is checked or parsed."""
     master, slave = pty.openpty()
     tty.setraw(slave)
-    writer = threading.Thread(target=_write, args=(master, b"".join(lines)))
-    writer.start()
     with serial.Serial(os.ttyname(slave), BAUD, timeout=5.0) as port:
+        writer = threading.Thread(target=_write, args=(master, b"".join(lines)))
+        writer.start()
         assert all(port.readline() == line for line in lines)
-    writer.join()
+        writer.join()
     os.close(master)
     os.close(slave)
 

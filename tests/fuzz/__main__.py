@@ -1,7 +1,7 @@
 """`python -m tests.fuzz PARSER [libFuzzer options]`: one parser of the serial drivers under coverage-guided fuzzing.
 
-Any byte string, in any pieces: no exception, a bounded buffer, and a good frame behind it is found. What crashes is kept
-in the working directory; run the same command with its path to see it again. Needs the extra `fuzz` (atheris).
+Any byte string, in any pieces: no exception, a bounded buffer, and a good frame behind it is found. What crashes is
+kept in the working directory; run the same command with its path to see it again. Needs the extra `fuzz` (atheris).
 """
 
 from __future__ import annotations

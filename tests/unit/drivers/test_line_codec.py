@@ -23,6 +23,7 @@ from drivers.line_codec import (
     parse_body,
     parse_line,
 )
+from sim.tracker.crc import checksum
 
 PAGE = Path(__file__).parents[3] / "docs" / "line-protocol.md"
 BODY = "PNT,2,82600000,N3,4123456,-876050,250000,22,31,30,1"
@@ -37,6 +38,11 @@ def test_checksum_vectors() -> None:
     assert crc16_arc(b"123456789") == 0xBB3D
     assert crc16_arc(b"RESET") == 0xBE6F  # NDI's reset line ends in these digits
     assert crc16_arc(b"") == 0
+
+
+@given(st.binary(max_size=700))
+def test_the_checksum_is_that_of_the_devices_own_code(data: bytes) -> None:
+    assert crc16_arc(data) == checksum(data)
 
 
 def test_the_page_shows_true_lines() -> None:
