@@ -15,6 +15,7 @@ from typing import Any
 import click
 
 from docking.cli_devices import devices, monitor
+from docking.cli_fit import fit
 from docking.cli_survey import layout, network
 from docking.errors import (
     EXIT_FAULT,
@@ -224,30 +225,6 @@ def sim(cell: Path, job: Path | None, seed: int, **files: Path | None) -> int:
     return EXIT_OK
 
 
-@cli.command()
-@click.argument("nominal", type=FILE)
-@click.argument("measured", type=FILE)
-@click.option(
-    "--method", type=click.Choice(["ml", "svd", "three-point", "least-squares"]), default="ml", show_default=True
-)
-@json_option
-def fit(nominal: Path, measured: Path, method: str, as_json: bool) -> int:
-    """Fit the pose that takes NOMINAL points into MEASURED coordinates (CSV files).
-
-    \b
-    Header: name,x_mm,y_mm,z_mm[,sx_mm,sy_mm,sz_mm]; passes of a point are rows with the same name.
-    Example: docking fit nominal.csv measured.csv --method svd --json
-    """
-    from docking.fit_report import fit_files, fit_text
-
-    result = fit_files(nominal, measured, method)
-    if as_json:
-        print_json(result)
-    else:
-        click.echo(fit_text(result))
-    return EXIT_FAULT if result["refused"] else EXIT_OK
-
-
 @cli.group()
 def study() -> None:
     """Long studies over many seeds; resumable, on all cores.
@@ -286,6 +263,7 @@ def study_dock(cells: tuple[Path, ...], as_json: bool, **options: Any) -> int:
     return EXIT_OK
 
 
+cli.add_command(fit)
 cli.add_command(layout)
 cli.add_command(devices)
 cli.add_command(monitor)

@@ -1,0 +1,64 @@
+"""The command that fits a pose to somebody's own points."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from docking.errors import EXIT_FAULT, EXIT_OK
+from docking.terminal import FILE, json_option, print_json, print_text
+
+NOISE = "Where MEASURED has no sigmas: iso:MM, tracker:X,Y,Z, total-station:X,Y,Z (station in the measured frame, mm)."
+LOCK = "Entries of the pose that are held: x,y,z,alpha,beta,gamma, each with =VALUE (mm or deg) where it is not 0."
+TEMPERATURE = "Nominal points grow: kelvins above their reference, and expansion, as in 2.5@23.1e-6."
+
+
+@click.command()
+@click.argument("nominal", type=FILE)
+@click.argument("measured", type=FILE)
+@click.option(
+    "--method",
+    type=click.Choice(["ml", "svd", "three-point", "least-squares"]),
+    default="ml",
+    show_default=True,
+    help="ml weighs every point by its covariance; the others weigh all alike.",
+)
+@click.option("--noise", metavar="SPEC", help=NOISE)
+@click.option("--lock", metavar="LIST", help=LOCK)
+@click.option(
+    "--exclude", metavar="NAMES", multiple=True, help="Points left out before anything else: P1,P2 (repeatable)."
+)
+@click.option("--temperature", metavar="DT_K@ALPHA_PER_K", help=TEMPERATURE)
+@click.option("--triangle", metavar="A,B,C", help="Corners for --method three-point (default: the largest triangle).")
+@click.option("--report", type=FILE, help="Write residual vectors, histogram and tables to this HTML file.")
+@json_option
+def fit(nominal: Path, measured: Path, report: Path | None, as_json: bool, **options: object) -> int:
+    """Fit the pose that takes NOMINAL points into MEASURED coordinates (CSV files).
+
+    Points that cannot be right are named with a reason and left out; where no answer is safe there is none, and the
+    exit code is 1. Header of the files: name,x_mm,y_mm,z_mm[,sx_mm,sy_mm,sz_mm]; passes of a point are rows of the same
+    name; (0,0,0) is a lost beam.
+
+    \b
+    Examples:
+      docking fit nominal.csv measured.csv
+      docking fit nominal.csv measured.csv --noise tracker:0,-9000,800 --report fit.html
+      docking fit nominal.csv measured.csv --noise iso:0.05 --lock z,alpha=0.5 --json
+      docking fit nominal.csv measured.csv --temperature 2.5@23.1e-6 --exclude T3,T7
+      docking fit nominal.csv measured.csv --method three-point --triangle A,B,C
+    """
+    from docking.fit_options import FitOptions
+    from docking.fit_report import fit_json, fit_text, run_fit
+
+    result = run_fit(nominal, measured, FitOptions(**options))  # type: ignore[arg-type]
+    if report is not None:
+        from docking.report.fit_page import write_fit_page
+
+        write_fit_page(result, f"{measured.name} fitted to {nominal.name}", report)
+    answer = fit_json(result)
+    if as_json:
+        print_json(answer)
+    else:
+        print_text(fit_text(answer))
+    return EXIT_FAULT if answer["refused"] else EXIT_OK

@@ -1,0 +1,158 @@
+"""One fit as a self-contained HTML page: residual vectors in space, histogram, tables; readable by day and by night."""
+
+from __future__ import annotations
+
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from docking.errors import FileUnwritable
+from docking.fit_report import FitResult, fit_json, judgement_lines
+from docking.pose.uncertainty import total_cov_mm2
+from docking.report.figures import COLOURS, GREY, LIMIT, WIDTH_IN, panels, style, svg
+from docking.types import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8"><meta name="color-scheme" content="light dark"><title>{title}</title>
+<style>
+:root{{--ink:#1c1c1c;--soft:#5c5c5c;--rule:#d3d3d3;--paper:#fff;--bad:#b00020}}
+@media (prefers-color-scheme:dark){{:root{{--ink:#e8e8e8;--soft:#a9a9a9;--rule:#4a4a4a;--paper:#161616;--bad:#ff7b8b}}}}
+body{{font:15px/1.45 sans-serif;max-width:60em;margin:2em auto;padding:0 1em;color:var(--ink);background:var(--paper)}}
+svg{{width:100%;height:auto}} svg text{{fill:var(--ink)!important}} h2{{margin-top:2em}}
+figcaption,.soft{{color:var(--soft)}} .bad{{color:var(--bad);font-weight:600}} .wide{{overflow-x:auto}}
+table{{border-collapse:collapse;font-variant-numeric:tabular-nums;font-size:.9em}}
+th,td{{padding:.15em .6em;text-align:right;border-bottom:1px solid var(--rule)}} .t{{text-align:left}}
+</style></head>
+<body><h1>{title}</h1>
+{body}
+</body></html>
+"""
+_SHARE = 0.15
+"""Length of the longest drawn residual, as a share of the part's extent."""
+
+
+def write_fit_page(result: FitResult, title: str, path: Path) -> None:
+    """Write the page of one `docking fit`, a refused one too. Raises FileUnwritable."""
+    answer = fit_json(result)
+    parts = (
+        [f'<p class="bad">No pose: {escape(answer["refused"])}</p>'] if answer["refused"] else _fitted(result, answer)
+    )
+    parts += _rejected("Rejected points", answer["rejected"]) + _rejected(
+        "Readings left out", answer["dropped_readings"]
+    )
+    try:
+        path.write_text(PAGE.format(title=escape(title), body="\n".join(parts)), encoding="utf-8")
+    except OSError as error:
+        raise FileUnwritable(str(path), error.strerror or str(error)) from error
+
+
+def _fitted(result: FitResult, answer: dict[str, Any]) -> list[str]:
+    pose, sigma = answer["pose"], answer["sigma"]
+    rows = [
+        [name, f"{pose[name]:.6f}", "-" if sigma[name] is None else f"{sigma[name]:.6f}"]
+        for name in ("x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
+    ]
+    with style():
+        vectors, factor = _vectors(result)
+        spread = _histogram(result)
+    used = f"{len(answer['used'])} points, method {answer['method']}, rms {answer['rms_mm']:.4f} mm, "
+    lines = [used + f"largest {answer['max_mm']:.4f} mm", *judgement_lines(answer)[1:]]
+    return [
+        *(f"<p>{escape(line)}</p>" for line in lines),
+        "<h2>Pose of the nominal in the measured frame</h2>",
+        '<p class="soft">R = Rz(gamma) Ry(beta) Rx(alpha)</p>',
+        _table(["", "value", "1 sigma"], rows),
+        "<h2>Residuals</h2>",
+        f"<figure>{vectors}<figcaption>Measured minus fitted at every used point, {factor:.3g} times its true length, "
+        "in the nominal frame; crosses are rejected points at their nominal place.</figcaption></figure>",
+        f"<figure>{spread}<figcaption>Residuals along the axes of the measured frame.</figcaption></figure>",
+        _residual_table(result),
+    ]
+
+
+def _vectors(result: FitResult) -> tuple[str, float]:
+    """Residuals as arrows in space, and how much longer than true they are drawn."""
+    from matplotlib.figure import Figure
+
+    assert result.fit is not None
+    assert result.screened is not None
+    figure = Figure(figsize=(WIDTH_IN, 0.6 * WIDTH_IN), facecolor="none")
+    panel: Any = figure.add_subplot(projection="3d", facecolor="none")
+    at, arrows = result.screened.nominal_mm, result.fit.residuals_mm @ result.fit.X_MN.R
+    factor = _SHARE * float(np.max(np.ptp(at, axis=0))) / max(result.fit.max_mm, 1e-9)
+    panel.scatter(*at.T, s=9, color=COLOURS[0])
+    panel.quiver(*at.T, *(factor * arrows).T, color=COLOURS[1], linewidth=1.2, arrow_length_ratio=0.2)
+    out = {r.name for r in result.fit.rejected}
+    crosses = result.nominal.xyz_mm[[name in out for name in result.nominal.names]]
+    panel.scatter(*crosses.T, s=30, color=LIMIT, marker="x")
+    for name, place in zip(result.nominal.names, result.nominal.xyz_mm, strict=True):
+        panel.text(*place, f" {name}", fontsize=6.5)
+    _quiet(panel, np.vstack([at, crosses]))
+    return svg(figure, "vectors"), factor
+
+
+def _quiet(panel: Any, points: Array) -> None:
+    """Equal scales; walls and grid that suit a light and a dark page."""
+    panel.set_box_aspect(np.maximum(np.ptp(points, axis=0), 0.05 * float(np.max(np.ptp(points, axis=0)))), zoom=1.2)
+    for letter, axis in zip("XYZ", (panel.xaxis, panel.yaxis, panel.zaxis), strict=True):
+        axis.set_pane_color((0.5, 0.5, 0.5, 0.06))
+        axis.set_label_text(f"{letter} / mm")
+        axis.line.set_color(GREY)
+        axis.set_tick_params(color=GREY)
+
+
+def _histogram(result: FitResult) -> str:
+    assert result.fit is not None
+    figure, (panel,) = panels(2.4)
+    _clear(figure)
+    reach = 1.05 * max(float(np.max(np.abs(result.fit.residuals_mm))), 1e-9)
+    bins = np.linspace(-reach, reach, 2 * min(8 + len(result.fit.names) // 8, 30) + 1)
+    for k, letter in enumerate("xyz"):
+        look: dict[str, Any] = {"histtype": "step", "linewidth": 1.4, "color": COLOURS[k], "label": f"d{letter}"}
+        panel.hist(result.fit.residuals_mm[:, k], bins=bins.tolist(), **look)
+    panel.axvline(0.0, color=GREY, linewidth=0.8)
+    panel.set_xlabel("residual / mm")
+    panel.set_ylabel("points")
+    panel.legend(loc="upper right")
+    return svg(figure, "histogram")
+
+
+def _clear(figure: Figure) -> None:
+    figure.set_facecolor("none")
+    for panel in figure.axes:
+        panel.set_facecolor("none")
+        panel.grid(color=GREY, alpha=0.35)
+        panel.tick_params(color=GREY)
+
+
+def _residual_table(result: FitResult) -> str:
+    assert result.fit is not None
+    assert result.screened is not None
+    s = total_cov_mm2(result.screened.nominal_cov_mm2, result.screened.measured_cov_mm2, result.fit.X_MN.R)
+    sigma = np.sqrt(s[:, range(3), range(3)])
+    rows = [
+        [name, *(f"{v:+.4f}" for v in r), f"{float(np.linalg.norm(r)):.4f}", *(f"{v:.4f}" for v in own)]
+        for name, r, own in zip(result.fit.names, result.fit.residuals_mm, sigma, strict=True)
+    ]
+    return _table(["point", "dx / mm", "dy / mm", "dz / mm", "length / mm", "sigma x", "sigma y", "sigma z"], rows)
+
+
+def _rejected(title: str, rows: list[dict[str, str]]) -> list[str]:
+    if not rows:
+        return []
+    cells = [[row["name"], row["reason"], row["detail"]] for row in rows]
+    return [f"<h2>{title}</h2>", _table(["point", "reason", "what was seen"], cells, words=True)]
+
+
+def _table(head: list[str], rows: list[list[str]], *, words: bool = False) -> str:
+    def cells(tag: str, values: list[str]) -> str:
+        marks = (' class="t"' if words or k == 0 else "" for k in range(len(values)))
+        return "".join(f"<{tag}{mark}>{escape(v)}</{tag}>" for mark, v in zip(marks, values, strict=True))
+
+    body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
+    return f'<div class="wide"><table><thead><tr>{cells("th", head)}</tr></thead><tbody>{body}</tbody></table></div>'
