@@ -15,7 +15,7 @@ from typing import Any
 import click
 
 from docking.cli_devices import devices, monitor
-from docking.cli_fit import fit
+from docking.cli_fit import fit, study_screening
 from docking.cli_survey import layout, network
 from docking.errors import (
     EXIT_FAULT,
@@ -264,6 +264,7 @@ def study_dock(cells: tuple[Path, ...], as_json: bool, **options: Any) -> int:
 
 
 cli.add_command(fit)
+study.add_command(study_screening)
 cli.add_command(layout)
 cli.add_command(devices)
 cli.add_command(monitor)
