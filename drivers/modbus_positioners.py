@@ -122,15 +122,24 @@ class ModbusPositioners:
 
     async def enable(self) -> Feedback:
         """Enable the driven axes where they stand; EnableFailed names a PLC that is in fault or does not follow."""
+        settings = self._settings()
         async with self._alone:
+            await self._reconnect()
             await self._all(plc.refresh() for plc in self._plcs)
             ill = [plc for plc in self._plcs if plc.state == "fault"]
             for plc in sorted(ill, key=lambda plc: plc.comes_after):
                 raise EnableFailed(plc.where, plc.fault_words(), value="fault")
+            await self._all(plc.arm(settings) for plc in self._plcs if plc.state == "disabled")
             await self._all(plc.command("enable") for plc in self._plcs)
             await self._all(plc.reach(ENABLE_S, "enabled", "held", "done") for plc in self._plcs)
             self._told_quick_stop = False
             return self._feedback()
+
+    async def _reconnect(self) -> None:
+        """On request only: whatever has lost its connection is proved anew."""
+        await self._all(plc.reconnect(self._settings()) for plc in self._plcs)
+        for plc in self._plcs:
+            plc.unit.on_lost = lambda: self.on_lost()
 
     async def load(self, plan: Plan) -> None:
         """Clear all queues, write the quick ramp of `plan` and fill them with its start. Nothing moves.
@@ -215,6 +224,8 @@ class ModbusPositioners:
             if verb in ("stop", "quick-stop"):
                 for plc in self._plcs:
                     plc.abandon()
+            if verb == "reset":
+                await self._reconnect()
             try:
                 await self._all(plc.command(verb) for plc in self._plcs if self._concerns(verb, plc))
             except DockingError:

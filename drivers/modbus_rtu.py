@@ -62,12 +62,12 @@ class RtuLine:
 
     def unit(self, where: str, number: int) -> RtuUnit:
         """The unit `number` (1..247) of this line."""
-        user = RtuUnit(self, where, number)
-        self._users.append(user)
-        return user
+        return RtuUnit(self, where, number)
 
-    async def open(self) -> None:
+    async def join(self, user: RtuUnit) -> None:
         """Open the port once for all units; PortMissing."""
+        if user not in self._users:
+            self._users.append(user)
         async with self._turn:
             if not self.is_open:
                 await self._link.open()
@@ -153,7 +153,7 @@ class RtuUnit(RegisterUnit):
 
     async def connect(self) -> None:
         """Open the line if nobody has; PortMissing."""
-        await self._line.open()
+        await self._line.join(self)
 
     def close(self) -> None:
         """Leave the line; the last unit closes it."""

@@ -1,7 +1,7 @@
 """One axis whose drive takes a target, a speed and an acceleration as numbers and goes there by itself (no PLC).
 
 Which registers these are is a file of `drivers/maps`. Such drives have no common start, no queue and no heartbeat of
-the host: axes that are written one after another are apart by speed x the time between the writes, and an axis under way
+the host: axes that are written one after another are apart by speed x the time between the writes, and one under way
 goes on when the host falls silent. They serve single axes that carry nothing together (a platform, a gate), not a part
 on several of them; no positioner of a cell file is of this kind.
 """

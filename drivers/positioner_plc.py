@@ -19,7 +19,9 @@ from docking.errors import (
     DeviceRefused,
     DockingError,
     EnableFailed,
+    LinkLost,
     OutcomeUnknown,
+    PortMissing,
     ReadBackMismatch,
     SegmentRejected,
     WrongIdentity,
@@ -35,6 +37,8 @@ ACKNOWLEDGE_SCANS = 3
 PLCs wait meanwhile."""
 ENABLE_S = 3.0
 LOOK_AGAIN_S = 0.005
+RECONNECT_S, RECONNECT_FIRST_S, RECONNECT_MOST_S = 3.0, 0.05, 0.5
+"""How long a broken connection is tried again, and the first and the longest wait between two tries."""
 REPEATABLE = frozenset(("hold", "stop", "quick-stop", "disable"))
 """Commands that only slow down: sent once more, under the same number, when the read-back shows they did not arrive."""
 
@@ -83,6 +87,7 @@ class PositionerPlc:
         self.depth = 0
         self.status = Status({}, [])
         self._asked_s = self._heard_s = float("nan")
+        self._armed = False
 
     # identity and settings -----------------------------------------------------------------------------------------
     async def bring_up(self, settings: Mapping[str, int]) -> Identity:
@@ -96,10 +101,38 @@ class PositionerPlc:
         if self.state != "disabled" and self.state != "fault":
             await self.command("disable")
             await self.reach(ENABLE_S, "disabled")
+        self._armed = False
         if self.state == "disabled":
-            await self._write_back("settings", settings)
+            await self.arm(settings)
         await self._prove_strokes()
         return identity
+
+    async def arm(self, settings: Mapping[str, int]) -> None:
+        """Write and read back the settings, the watchdog among them, where this connection has not seen them yet.
+
+        A controller may forget its watchdog with the connection. Raises ReadBackMismatch.
+        """
+        if not self._armed:
+            await self._write_back("settings", settings)
+            self._armed = True
+
+    async def reconnect(self, settings: Mapping[str, int]) -> None:
+        """Behind a broken connection: try again, at growing distances, and prove everything anew. PortMissing after
+        RECONNECT_S."""
+        if self.unit.connected:
+            return
+        loop = asyncio.get_running_loop()
+        end_s, wait_s = loop.time() + RECONNECT_S, RECONNECT_FIRST_S
+        while True:
+            try:
+                await self.bring_up(settings)
+            except (PortMissing, LinkLost):
+                if not loop.time() + wait_s < end_s:
+                    raise
+            else:
+                return
+            await asyncio.sleep(wait_s)
+            wait_s = min(2.0 * wait_s, RECONNECT_MOST_S)
 
     async def _read_block(self, name: str) -> tuple[dict[str, Any], list[tuple[int, ...]]]:
         block = self._blocks[name]

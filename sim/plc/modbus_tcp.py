@@ -119,6 +119,13 @@ def answer(units: Mapping[int, RegisterDevice], unit: int, function: int, body: 
         return bytes((function | 0x80, ILLEGAL_VALUE))
 
 
+@runtime_checkable
+class Forgetful(Protocol):
+    """A unit that hears of every connection that is opened."""
+
+    def opened(self) -> None: ...
+
+
 class ModbusTcpConnection(asyncio.Protocol):
     """One client connection to a host that holds `units` (unit id -> registers); `tap(by client, bytes)` hears it."""
 
@@ -135,6 +142,9 @@ class ModbusTcpConnection(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast(asyncio.Transport, transport)
         self._connections.add(self)
+        for device in self._units.values():
+            if isinstance(device, Forgetful):
+                device.opened()
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._connections.discard(self)

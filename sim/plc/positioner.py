@@ -8,7 +8,7 @@ RUN low, and all ramp and wait; one with an axis in fault drops GROUP_OK, and al
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from docking.config.cell import PositionerConfig
@@ -71,21 +71,18 @@ class PositionerPlc:
         self.settings = Settings()
         self._quick_ramp_ms, self._rate_permille = self.settings.ramp_ms, reg.FULL_RATE
         self.state, self.fault = State.DISABLED, Fault.NONE
-        self.braked = True
+        self.braked, self.forgets_watchdog = True, False
         self.target_mm: Point = sensors.point_mm()
         self._after_stop = State.HELD
         self._clear_after_stop = False
         self._since_s = clock()
-        self._plan_id = 0
+        self._plan_id = self._command_ack = 0
         self._segment_result, self._command_result = Reject.NONE, Reject.NONE
-        self._command_ack = 0
         self._pending: tuple[int, int, int] | None = None
         self._heartbeat, self._heartbeat_s, self._heartbeat_seen = 0, clock(), False
         self._lines = Lines(run=False, group_ok=True)
-        self._drops_group = False
-        self._fault_axis = -1
-        self._start_rate = 0.0
-        self._scans = 0
+        self._drops_group, self._fault_axis = False, -1
+        self._start_rate, self._scans = 0.0, 0
         self._station = reg.crc16(config.name.encode("ascii"))
         self._identity = self._identity_block()
         self._limits = b"".join(
@@ -132,6 +129,11 @@ class PositionerPlc:
             self._set_motion(*reg.MOTION.unpack(data))
         else:
             raise ModbusRefusal(ILLEGAL_ADDRESS)
+
+    def opened(self) -> None:
+        """A host has connected: some controllers forget the watchdog of the connection before."""
+        if self.forgets_watchdog:
+            self.settings = replace(self.settings, watchdog_ms=0)
 
     def _beat(self, count: int) -> None:
         if count != self._heartbeat:
