@@ -48,7 +48,8 @@ class TrackerConfig(Model):
         default=10.0, description="repeatability of a reflector in its nest, 1 sigma a coordinate, um"
     )
     calibration_due: date | None = Field(
-        default=None, description="date on which the instrument is due for calibration; `docking devices` warns after it"
+        default=None,
+        description="date on which the instrument is due for calibration; `docking devices` warns after it",
     )
     two_face: bool = Field(default=False, description="the instrument measures in both faces")
     two_face_limit_mm: Positive = Field(
@@ -253,9 +254,7 @@ class LimitsConfig(Model):
     ball_residual_mm: Positive = Field(
         default=0.1, description="stop when the read-backs part from a rigid figure by more, mm"
     )
-    ball_rms_mm: Positive = Field(
-        default=0.06, description="the same for the root mean square over the balls, mm"
-    )
+    ball_rms_mm: Positive = Field(default=0.06, description="the same for the root mean square over the balls, mm")
     ball_pair_mm: Positive = Field(
         default=0.15, description="stop when the distance of two balls changes by more, by the read-backs, mm"
     )

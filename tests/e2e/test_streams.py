@@ -24,9 +24,7 @@ CAMERA_POSE = (1500.0, -1800.0, 900.0, -90.0, 0.0, 45.0)
 def test_what_the_sensors_stream_is_what_the_component_does(tmp_path: Path) -> None:
     (tmp_path / "frame.rom").write_bytes(b"NDI\\0 a definition" + bytes(90))
     tools = ({"name": "frame", "rom": "frame.rom"},)
-    camera_config = NdiConfig.model_validate(
-        {"port": "x", "station_pose": CAMERA_POSE, "rate_hz": 5.0, "tools": tools}
-    )
+    camera_config = NdiConfig.model_validate({"port": "x", "station_pose": CAMERA_POSE, "rate_hz": 5.0, "tools": tools})
 
     async def main() -> tuple[DryCell, list[PointFrame], list[InertialSample], list[str]]:
         run = DryCell("lab-can", 3, tmp_path / "run.jsonl")

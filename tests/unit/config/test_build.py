@@ -35,7 +35,8 @@ def files(name: str) -> tuple[CellFile, JobFile]:
 
 
 @pytest.mark.parametrize(
-    "name", ["fuselage-can", "fuselage-modbus", "follower-can", "follower-force-can", "wing-modbus", "lab-can", "lab-modbus"]
+    "name",
+    ["fuselage-can", "fuselage-modbus", "follower-can", "follower-force-can", "wing-modbus", "lab-can", "lab-modbus"],
 )
 def test_geometry_is_that_of_the_files(name: str) -> None:
     cell, job = files(name)

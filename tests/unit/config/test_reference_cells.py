@@ -18,7 +18,15 @@ from docking.geometry import pose_from_vector
 from docking.kinematics.forces import ball_reactions_n
 
 CELLS = Path(__file__).parents[3] / "sim" / "cells"
-NAMES = ("fuselage-can", "fuselage-modbus", "follower-can", "follower-force-can", "wing-modbus", "lab-can", "lab-modbus")
+NAMES = (
+    "fuselage-can",
+    "fuselage-modbus",
+    "follower-can",
+    "follower-force-can",
+    "wing-modbus",
+    "lab-can",
+    "lab-modbus",
+)
 
 
 def load(name: str) -> tuple[CellFile, JobFile]:

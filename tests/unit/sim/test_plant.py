@@ -10,7 +10,15 @@ from docking.errors import ConfigInvalid
 from docking.types import Pose
 from sim.truth import ERROR_NAMES
 
-CELLS = ("fuselage-can", "fuselage-modbus", "follower-can", "follower-force-can", "wing-modbus", "lab-can", "lab-modbus")
+CELLS = (
+    "fuselage-can",
+    "fuselage-modbus",
+    "follower-can",
+    "follower-force-can",
+    "wing-modbus",
+    "lab-can",
+    "lab-modbus",
+)
 G = 9.80665
 
 

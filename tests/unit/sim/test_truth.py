@@ -11,7 +11,15 @@ import sim
 from docking.errors import ConfigInvalid, FileUnreadable
 from sim.truth import ERROR_NAMES, Draws, load_truth
 
-CELLS = ("fuselage-can", "fuselage-modbus", "follower-can", "follower-force-can", "wing-modbus", "lab-can", "lab-modbus")
+CELLS = (
+    "fuselage-can",
+    "fuselage-modbus",
+    "follower-can",
+    "follower-force-can",
+    "wing-modbus",
+    "lab-can",
+    "lab-modbus",
+)
 
 
 @pytest.mark.parametrize("name", CELLS)
