@@ -334,7 +334,7 @@ class Withholding(AutomaticOperator):
 
 
 @pytest.mark.parametrize(
-    ("operator", "outcome", "code"), [(Aborting, "stopped", 4), (Declining, "stopped", 4), (Withholding, "refused", 1)]
+    ("operator", "outcome", "code"), [(Aborting, "stopped", 4), (Declining, "stopped", 4), (Withholding, "fault", 1)]
 )
 @pytest.mark.parametrize("name", ["lab-can", "lab-modbus"])
 def test_the_command_says_how_a_run_ended(name, operator, outcome, code, monkeypatch, capsys, tmp_path):
@@ -343,10 +343,11 @@ def test_the_command_says_how_a_run_ended(name, operator, outcome, code, monkeyp
     exit_code = cli.call(["dry-run", str(CELLS / f"{name}.toml"), "--json", "--journal", str(journal)])
     told = json.loads(capsys.readouterr().out)
     assert (told["outcome"], exit_code) == (outcome, code)
-    assert told["moves"] == (1 if operator is Aborting else 0)
+    assert told["moves"] == (0 if operator is Declining else 1)
     if operator is Withholding:
         assert [alarm["code"] for alarm in told["alarms"]] == [2112]
-        assert told["alarms"][0]["where"] == "crane_free"
+        # The only one that is not wired: the first stage does not ask for it.
+        assert told["alarms"][0]["where"] == "reflectors_off"
     else:
         assert told["alarms"] == []
     verify(journal)
