@@ -126,8 +126,8 @@ def dry_run(cell: Path, job: Path | None, seed: int, as_json: bool, **files: Pat
     """Dock against simulated devices in virtual time: real state machine, real drivers, real bytes.
 
     \b
-    Examples: docking dry-run sim/cells/fuselage-can.toml --seed 7 --report report.html
-              docking dry-run sim/cells/lab-can.toml --scenario sim/scenarios/crane-moves-in.toml
+    Example: docking dry-run sim/cells/fuselage-can.toml --seed 7 --report report.html
+    Example: docking dry-run sim/cells/lab-can.toml --scenario sim/scenarios/crane-moves-in.toml
     """
     from docking import assemble
 

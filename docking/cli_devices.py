@@ -32,8 +32,8 @@ def devices(cell: Path, sim: bool, wires: Path | None, prove: bool, transcript: 
     Reads only, without --prove. Exits with 0 when every device answers as it should, else with 1 and its name.
 
     \b
-    Examples: docking devices sim/cells/lab-can.toml --sim
-              docking devices cell.toml --prove --transcript bring-up.txt
+    Example: docking devices sim/cells/lab-can.toml --sim
+    Example: docking devices cell.toml --prove --transcript bring-up.txt
     """
     from docking.assemble.commissioning import devices_text, find_devices
 

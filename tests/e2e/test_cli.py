@@ -20,7 +20,7 @@ import pytest
 
 from docking.cli import call
 from docking.errors import catalogue
-from tests.support.program import CELLS, PROGRAM, cell_copy, environment, quick_cell, served
+from tests.support.program import CELLS, PROGRAM, cell_copy, environment, quick_cell, unwired, served
 
 LAB = CELLS / "lab-can.toml"
 MODBUS = CELLS / "lab-modbus.toml"
@@ -152,7 +152,7 @@ def test_a_checked_pair_of_files_exits_with_0(docking) -> None:
 
 
 def test_a_tolerance_that_the_run_cannot_prove_exits_with_3(docking, tmp_path: Path) -> None:
-    cell = cell_copy(tmp_path, "lab-can", (".job.toml", " tolerance_mm = 0.1,", " tolerance_mm = 0.042,"))
+    cell = unwired(cell_copy(tmp_path, "lab-can", (".job.toml", " tolerance_mm = 0.1,", " tolerance_mm = 0.042,")))
     ran = docking("dry-run", cell)
     assert (ran.code, ran.told["outcome"]) == (3, "out_of_tolerance")
     alarm = ran.alarm()
