@@ -25,8 +25,8 @@ from docking.types import Array, Pose
 
 ANGLES = ("alpha", "beta", "gamma")
 TRANSLATIONS = ("x", "y", "z")
-_GRID = 24
-"""Start values of a free angle: within 8 degrees of the best, wherever that is."""
+_GRID = 12
+"""Start values of a free angle: within 15 degrees of the best, wherever that is."""
 _RANK = 1e-10
 
 
