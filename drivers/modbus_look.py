@@ -12,10 +12,13 @@ from typing import Any
 from docking.config.cell import CellFile, ModbusBus, PositionerConfig
 from docking.config.inputs import ModbusModule
 from docking.errors import BadReply, DockingError, WrongIdentity
+from docking.ports import SerialLink
 from docking.types import Identity
 from drivers.look import AxisValue, Found, Stopwatch
 from drivers.maps.io_modules import load_modbus_io
 from drivers.modbus_client import ModbusUnit, Tap, tapped
+from drivers.modbus_requests import RegisterUnit
+from drivers.modbus_wires import units_of
 from drivers.register_map import RegisterMap, load_map
 
 ROUND_TRIPS = 10
@@ -26,7 +29,7 @@ PHASE_S = 0.5
 class _Station:
     """One connection and how long its answers took."""
 
-    def __init__(self, name: str, where: str, unit: ModbusUnit, address: str) -> None:
+    def __init__(self, name: str, where: str, unit: RegisterUnit, address: str) -> None:
         self.name, self.where, self.unit, self.address = name, where, unit, address
         self.watch = Stopwatch()
 
@@ -36,25 +39,23 @@ class _Station:
 
 
 class ModbusLook:
-    """The Modbus devices of a cell. `addresses` overrides the cell file by name."""
+    """The Modbus devices of a cell. `addresses` overrides the cell file by name, `link` its serial line; `tap` hears
+    all bytes of TCP connections."""
 
     def __init__(
-        self, cell: CellFile, addresses: Mapping[str, tuple[str, int]] | None = None, tap: Tap | None = None
+        self,
+        cell: CellFile,
+        addresses: Mapping[str, tuple[str, int]] | None = None,
+        tap: Tap | None = None,
+        link: SerialLink | None = None,
     ) -> None:
         self._cell, given = cell, addresses or {}
         self._bus = cell.bus if isinstance(cell.bus, ModbusBus) else None
         self._map: RegisterMap | None = load_map(self._bus.map) if self._bus is not None else None
+        self._plcs = _positioners(cell, self._bus, given, tap, link) if self._bus is not None else {}
         modules = cell.inputs.modules if cell.inputs is not None else ()
         self._modules = {m.name: m for m in modules if isinstance(m, ModbusModule)}
-        self._plcs = {
-            p.name: _station(p.name, f"positioner {p.name}", (given.get(p.name), p.host, p.port), p.unit or 1, bus, tap)
-            for bus in ([self._bus] if self._bus is not None else [])
-            for p in cell.positioners
-        }
-        self._inputs = {
-            m.name: _station(m.name, f"input module {m.name}", (given.get(m.name), m.host, m.port), m.unit, m, tap)
-            for m in self._modules.values()
-        }
+        self._inputs = {m.name: _module(m, given.get(m.name), tap) for m in self._modules.values()}
 
     def close(self) -> None:
         for station in (*self._plcs.values(), *self._inputs.values()):
@@ -122,7 +123,8 @@ class ModbusLook:
         scan counter is read over and over; a count that has moved between two reads bounds the instant of a scan.
         """
         stations = [station for station in self._plcs.values() if station.unit.connected]
-        if self._bus is None or len(stations) < 2:
+        if self._bus is None or self._bus.line is not None or len(stations) < 2:
+            # On one serial line the units are read in turn, too seldom to see a scan.
             return None
         seen = await asyncio.gather(*(self._ticks(station) for station in stations))
         if not all(seen):
@@ -203,16 +205,25 @@ class ModbusLook:
         return head
 
 
-def _station(
-    name: str,
-    where: str,
-    at: tuple[tuple[str, int] | None, str | None, int | None],
-    unit: int,
-    timing: ModbusBus | ModbusModule,
+def _positioners(
+    cell: CellFile,
+    bus: ModbusBus,
+    given: Mapping[str, tuple[str, int]],
     tap: Tap | None,
-) -> _Station:
-    given, host, port = at
-    address = given or (host or "127.0.0.1", port or 502)
-    client = ModbusUnit(where, *address, unit, timing.timeout_s)
-    client.tap = tapped(tap, name)
-    return _Station(name, where, client, f"{address[0]}:{address[1]} unit {unit}")
+    link: SerialLink | None,
+) -> dict[str, _Station]:
+    addresses = {p.name: given.get(p.name, (p.host or "127.0.0.1", p.port or 502)) for p in cell.positioners}
+    stations = {}
+    for config, unit in zip(cell.positioners, units_of(cell, bus, addresses, tap, link), strict=True):
+        at = bus.line if bus.line is not None else "{}:{}".format(*addresses[config.name])
+        where = f"positioner {config.name}"
+        stations[config.name] = _Station(config.name, where, unit, f"{at} unit {config.unit or 1}")
+    return stations
+
+
+def _module(config: ModbusModule, given: tuple[str, int] | None, tap: Tap | None) -> _Station:
+    host, port = given or (config.host, config.port)
+    where = f"input module {config.name}"
+    unit = ModbusUnit(where, host, port, config.unit, config.timeout_s)
+    unit.tap = tapped(tap, config.name)
+    return _Station(config.name, where, unit, f"{host}:{port} unit {config.unit}")

@@ -11,6 +11,7 @@ from docking.assemble.controller import tracker_of
 from docking.assemble.looking import Ends, LookRequest, load_looked_at, wires_of
 from docking.assemble.real_time import run_real
 from docking.assemble.timed import TimedCan, TimedSerial
+from docking.assemble.wires import transcribed_line
 from docking.config import CellFile
 from docking.config.cell import CanBus
 from docking.errors import DockingError, LinkError
@@ -38,7 +39,7 @@ def find_devices(request: LookRequest, *, prove: bool = False) -> dict[str, Any]
             skew = None
             if ends.can is not None:
                 rows += await _bus(cell, ends.can)
-            look = ModbusLook(cell, ends.modbus, ends.transcript.modbus if ends.transcript is not None else None)
+            look = ModbusLook(cell, ends.modbus, ends.tap, transcribed_line(cell, ends.transcript))
             try:
                 rows += await look.find()
                 skew = await look.start_skew_s()
@@ -89,7 +90,7 @@ async def _prove(cell: CellFile, ends: Ends) -> tuple[DockingError | None, tuple
         timed = TimedCan(ends.can, frozenset(0x180 + node for node in nodes))
         positioners = CanopenPositioners(cell, timed)
     else:
-        positioners = ModbusPositioners(cell, ends.modbus, ends.transcript.modbus if ends.transcript else None)
+        positioners = ModbusPositioners(cell, ends.modbus, ends.tap, transcribed_line(cell, ends.transcript))
     problem = None
     try:
         await positioners.bring_up()

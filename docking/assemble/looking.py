@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +37,11 @@ class Ends:
     can: CanLink | None
     modbus: Addresses | None
     transcript: Transcript | None
+
+    @property
+    def tap(self) -> Callable[[str, bool, bytes], None] | None:
+        """What hears all bytes of Modbus connections."""
+        return self.transcript.modbus if self.transcript is not None else None
 
 
 @asynccontextmanager

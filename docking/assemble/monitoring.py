@@ -9,6 +9,7 @@ from typing import Any
 
 from docking.assemble.looking import Ends, LookRequest, load_looked_at, wires_of
 from docking.assemble.real_time import on_interrupt, run_real
+from docking.assemble.wires import transcribed_line
 from docking.config import CellFile
 from docking.config.cell import CanBus
 from docking.config.inputs import InputsConfig
@@ -42,7 +43,7 @@ async def _watch(
     loop = asyncio.get_running_loop()
     began_s = loop.time()
     bus = BusLook(cell, ends.can) if ends.can is not None else None
-    modbus = ModbusLook(cell, ends.modbus, ends.transcript.modbus if ends.transcript is not None else None)
+    modbus = ModbusLook(cell, ends.modbus, ends.tap, transcribed_line(cell, ends.transcript))
     try:
         if bus is not None:
             await bus.open()

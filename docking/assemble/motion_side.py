@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 
-from docking.assemble.wires import Addresses
+from docking.assemble.wires import Addresses, transcribed_line
 from docking.config import CellFile, JobFile
 from docking.config.cell import ModbusBus
 from docking.config.inputs import InputsConfig, ModbusModule
@@ -31,21 +31,26 @@ def local_motion(
     cell: CellFile, job: JobFile, can: CanLink | None, modbus: Addresses | None, transcript: Transcript | None = None
 ) -> LocalMotion:
     """What drives the axes and reads the inputs, in the process that calls; `transcript` gets all bytes."""
-    inputs, tap = cell.inputs, transcript.modbus if transcript is not None else None
+    inputs = cell.inputs
     if transcript is not None and can is not None:
         can = TranscribedCan(can, transcript)
     if inputs is None:
-        return _axes(cell, job, can, modbus, tap)
+        return _axes(cell, job, can, modbus, transcript)
     shared = SharedCan(can) if can is not None else None
-    motion = _axes(cell, job, shared.end() if shared is not None else None, modbus, tap)
+    motion = _axes(cell, job, shared.end() if shared is not None else None, modbus, transcript)
+    tap = transcript.modbus if transcript is not None else None
     modules = input_modules(inputs, shared, modbus, tap)
     return GuardedMotion(motion, WiredInputs(inputs, modules), input_rules(inputs))
 
 
-def _axes(cell: CellFile, job: JobFile, can: CanLink | None, modbus: Addresses | None, tap: Tap | None) -> LocalMotion:
+def _axes(
+    cell: CellFile, job: JobFile, can: CanLink | None, modbus: Addresses | None, transcript: Transcript | None
+) -> LocalMotion:
     watch = watch_from(cell, job)
     if isinstance(cell.bus, ModbusBus):
-        return QueuedMotion(ModbusPositioners(cell, modbus, tap), watch, cell.bus.poll_s)
+        tap = transcript.modbus if transcript is not None else None
+        positioners = ModbusPositioners(cell, modbus, tap, transcribed_line(cell, transcript))
+        return QueuedMotion(positioners, watch, cell.bus.poll_s)
     if can is None:
         raise ValueError("a CANopen cell needs the near end of its bus")
     return StreamedMotion(CanopenPositioners(cell, can), watch, cell.limits.tick_late_cycles)

@@ -7,7 +7,9 @@ from typing import Any
 
 from docking.config import CellFile
 from docking.ports import CanLink, SerialLink
+from docking.transcript import TranscribedSerial, Transcript
 from drivers.links.can_bus import CanBusLink
+from drivers.links.serial_port import SerialPort
 
 Addresses = dict[str, tuple[str, int]]
 
@@ -19,6 +21,14 @@ class Wires:
     serial: SerialLink
     can: CanLink | None = None
     modbus: Addresses | None = None
+
+
+def transcribed_line(cell: CellFile, transcript: Transcript | None) -> SerialLink | None:
+    """The serial line of all positioners with its bytes in the transcript; None where there is no such thing."""
+    bus = cell.bus
+    if transcript is None or bus.kind == "canopen" or bus.line is None:
+        return None
+    return TranscribedSerial(SerialPort(bus.line, bus.baud, "Modbus line"), transcript, "modbus")
 
 
 def near_bus(cell: CellFile, found: dict[str, Any]) -> tuple[CanLink | None, Addresses | None]:
