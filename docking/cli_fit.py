@@ -41,8 +41,7 @@ def fit(nominal: Path, measured: Path, report: Path | None, as_json: bool, **opt
     name; (0,0,0) is a lost beam.
 
     \b
-    Examples:
-      docking fit nominal.csv measured.csv
+    Example: docking fit nominal.csv measured.csv
       docking fit nominal.csv measured.csv --noise tracker:0,-9000,800 --report fit.html
       docking fit nominal.csv measured.csv --noise iso:0.05 --lock z,alpha=0.5 --json
       docking fit nominal.csv measured.csv --temperature 2.5@23.1e-6 --exclude T3,T7

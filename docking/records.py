@@ -50,6 +50,8 @@ def fit_record(fit: Fit, what: str, stage: str) -> dict[str, Any]:
         "iterations": fit.iterations,
         "chi2": fit.chi2,
         "dof": fit.dof,
+        "redundancy": fit.redundancy,
+        "scale": 1.0 + fit.expansion,
         "used": list(fit.names),
         "rejected": rejection_records(fit.rejected),
         "residuals_mm": _residuals(fit),
