@@ -19,6 +19,8 @@ from docking.pose.quantiles import chi2_tail
 from docking.types import Array, Fit, Points, Pose, Rejection, Screened
 
 SIGMAS = ("alpha_deg", "beta_deg", "gamma_deg", "x_mm", "y_mm", "z_mm")
+_DOUBTFUL = 1e-3
+_TOO_LARGE = "MORE THAN THE SIGMAS LET EXPECT: noise, locks or nominal are wrong, or the part is not rigid"
 _EMPTY: dict[str, Any] = {
     "pose": None,
     "rms_mm": None,
@@ -173,7 +175,9 @@ def judgement_lines(result: dict[str, Any]) -> list[str]:
         + " deg"
     ]
     if result["chi2_p"] is not None:
-        lines.append(f"chi2 {result['chi2']:.1f} for {result['dof']} degrees of freedom (p = {result['chi2_p']:.3g})")
+        verdict = "as the sigmas let expect" if result["chi2_p"] >= _DOUBTFUL else _TOO_LARGE
+        text = f"chi2 {result['chi2']:.1f} for {result['dof']} degrees of freedom (p = {result['chi2_p']:.3g})"
+        lines.append(f"{text}: {verdict}")
     if result["redundancy"] == 0:
         lines.append("NO REDUNDANCY: three points define a pose, nothing in the fit could prove it wrong")
     if result["scale"] != 1.0:

@@ -7,7 +7,7 @@ the fit settles the borderline. The tolerance comes from the covariances; where 
 
 from __future__ import annotations
 
-from math import comb
+from math import exp, lgamma, log
 from typing import NamedTuple
 
 import numpy as np
@@ -308,7 +308,8 @@ def _accidental(graph: _Graph, kept: list[int]) -> float:
         return 0.0
     edges = sum(a.bit_count() for a in graph.adj) - sum((graph.adj[i] & inside).bit_count() for i in kept)
     rate = (0.5 * edges + 0.5) / (pairs + 1.0)
-    return float(comb(n, m) * rate ** (m * (m - 1) // 2))
+    ways = lgamma(n + 1) - lgamma(m + 1) - lgamma(n - m + 1)
+    return exp(min(ways + 0.5 * m * (m - 1) * log(rate), 700.0))
 
 
 def _posterior_sigma_mm(pairs: Pairs, tested: Tested) -> float:

@@ -92,6 +92,26 @@ def test_moving_both_frames_moves_the_pose(seed: int, n: int, name: str) -> None
 
 
 @settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6), st.integers(4, 15), st.sampled_from(METHODS), st.sampled_from([1.0, 1e-3, 1 / 25.4]))
+def test_a_whole_fit_follows_frames_and_unit_of_length(seed: int, n: int, method: str, unit: float) -> None:
+    """Pose, covariance and chi-square of any method, with covariances that turn and scale along."""
+    rng = np.random.default_rng(seed)
+    j = rng.uniform(-3000.0, 3000.0, (n, 3))
+    root = rng.normal(0.0, 0.05, (n, 3, 3)) + 0.05 * np.eye(3)
+    cov = root @ root.transpose(0, 2, 1) + 1e-4 * np.eye(3)
+    p = random_pose(rng).apply(j) + rng.normal(0.0, 0.1, j.shape)
+    A, B = random_pose(rng), random_pose(rng)
+    one = fit_pose(screened(j, p, cov), FitSettings(method=method))
+    moved = screened(unit * A.apply(j), unit * B.apply(p), unit**2 * B.R @ cov @ B.R.T)
+    two = fit_pose(moved, FitSettings(method=method))
+    back = B.inverse() @ Pose(two.X_MN.R, two.X_MN.t_mm / unit) @ A
+    assert largest_gap_mm(back, one.X_MN, j) <= 1e-6
+    turn = np.kron(np.diag([1.0, unit]), B.R)
+    assert np.allclose(turn @ one.cov @ turn.T, two.cov, rtol=1e-4, atol=1e-6 * np.max(np.diag(two.cov)[:3]))
+    assert two.chi2 == pytest.approx(one.chi2, rel=1e-5)
+
+
+@settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10**6), st.integers(4, 15), st.sampled_from(METHODS))
 def test_order_of_points_does_not_matter(seed: int, n: int, method: str) -> None:
     rng = np.random.default_rng(seed)

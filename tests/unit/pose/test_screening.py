@@ -396,6 +396,13 @@ def test_hundreds_of_points_with_many_wrong(sigma_mm: float) -> None:
     assert set(reasons(scene.screen())) == {scene.names[i] for i in bad}
 
 
+def test_a_thousand_points_with_a_third_wrong() -> None:
+    scene = Scene(30, 900)
+    bad = list(range(0, 900, 3))
+    scene.aim_wrong(bad, 20.0, 300.0)
+    assert set(bad) <= {scene.names.index(r.name) for r in scene.screen().rejected}
+
+
 def test_measured_sigma_alone_leaves_the_nominal_to_be_estimated() -> None:
     scene = Scene(19)
     scene.p += scene.rng.normal(0.0, 0.3, scene.p.shape)
