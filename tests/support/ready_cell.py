@@ -36,7 +36,7 @@ CYCLE_S = 0.01
 
 @cache
 def production_files(name: str) -> tuple[CellFile, JobFile]:
-    """A reference cell with the limits of a production cell (a CPU of its own, two missing read-backs), inputs unwired."""
+    """A reference cell with a production cell's limits (a CPU of its own, two missing read-backs), inputs unwired."""
     cell = load_cell(CELLS / f"{name}.toml")
     limits = cell.limits.model_copy(update={"missing_cycles": 2, "tick_late_cycles": 2})
     cell = cell.model_copy(update={"limits": limits, "inputs": None})
