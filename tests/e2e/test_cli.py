@@ -20,7 +20,7 @@ import pytest
 
 from docking.cli import call
 from docking.errors import catalogue
-from tests.support.program import CELLS, PROGRAM, cell_copy, environment, quick_cell, unwired, served
+from tests.support.program import CELLS, PROGRAM, cell_copy, environment, quick_cell, served, unwired
 
 LAB = CELLS / "lab-can.toml"
 MODBUS = CELLS / "lab-modbus.toml"
@@ -381,8 +381,8 @@ def test_swapped_serial_numbers_are_a_wrong_identity(docking, tmp_path: Path) ->
     cell = cell_copy(
         tmp_path,
         "lab-can",
-        (".toml", 'name = "X", node = 1,', 'name = "X", node = 1, serial_number = 402002,'),
-        (".toml", 'name = "Y", node = 2,', 'name = "Y", node = 2, serial_number = 402001,'),
+        (".toml", "node = 1, serial_number = 402001,", "node = 1, serial_number = 402002,"),
+        (".toml", "node = 2, serial_number = 402002,", "node = 2, serial_number = 402001,"),
     )
     ran = docking("dry-run", cell)
     assert (ran.code, ran.told["outcome"], ran.told["moves"]) == (1, "refused", 0)
