@@ -388,7 +388,7 @@ def test_swapped_serial_numbers_are_a_wrong_identity(docking, tmp_path: Path) ->
     assert (ran.code, ran.told["outcome"], ran.told["moves"]) == (1, "refused", 0)
     alarm = ran.alarm()
     assert (alarm["code"], alarm["where"]) == (1003, "A.X")
-    assert (alarm["value"], alarm["limit"]) == ("serial number 402001", "serial number 402002")
+    assert (alarm["value"], alarm["limit"]) == ("serial 402001", "serial 402002")
 
 
 def test_an_unreachable_pose_names_the_axis_and_its_stroke(docking, tmp_path: Path) -> None:
