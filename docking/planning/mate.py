@@ -114,7 +114,9 @@ def _check_corridor(
     straight = scene.X_WG.apply(points_C) - samples.gap_mm[inside, None, None, None] * axis_W
     away = np.linalg.norm(edges.at(samples.s[inside]) - straight, axis=-1).max(axis=(1, 2))
     closing = float(samples.gap_mm[0] - samples.gap_mm.min())
-    if np.all(away <= mate.corridor_mm) or (_only_back(away - mate.corridor_mm) and closing <= mate.contact_mm):
+    leaves = bool(inside[-1] < len(samples.gap_mm) - 1)
+    back = _only_back(away - mate.corridor_mm, leaves=leaves) and closing <= mate.contact_mm
+    if back or np.all(away <= mate.corridor_mm):
         return
     i = int(np.argmax(away))
     s, gap = float(samples.s[inside[i]]), float(samples.gap_mm[inside[i]])
@@ -125,10 +127,11 @@ def _check_corridor(
     raise ApproachRefused("corridor", cause, value=float(away[i]), limit=mate.corridor_mm)
 
 
-def _only_back(over_mm: Array) -> bool:
-    """True when what is over its limit was so from the start, and only shrinks."""
+def _only_back(over_mm: Array, *, leaves: bool) -> bool:
+    """True when what is over its limit was so from the start, never grows, and shrinks or leaves the corridor."""
     excess = np.maximum(over_mm, 0.0)
-    return bool(excess[0] > 0.0 and excess[-1] < excess[0] and np.all(np.diff(excess) <= _ROUNDING_MM))
+    falls = leaves or bool(excess[-1] < excess[0])
+    return bool(excess[0] > 0.0 and falls and np.all(np.diff(excess) <= _ROUNDING_MM))
 
 
 def _check_clearance(

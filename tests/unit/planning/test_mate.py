@@ -144,6 +144,8 @@ def test_outside_the_corridor_the_way_back_is_open() -> None:
     crooked = standing(30.0, (6.0, 0.0))
     plan(crooked, standing(30.0), standoff_mm=30.0, from_standoff_mm=100.0)
     plan(crooked, standing(60.0), standoff_mm=60.0, from_standoff_mm=100.0)
+    edge = replace(SETTINGS, corridor_length_mm=30.001)  # left again at once: a single sample lies inside
+    plan(crooked, standing(60.0), edge, standoff_mm=60.0, from_standoff_mm=100.0)
     with pytest.raises(ApproachRefused, match="corridor"):
         plan(crooked, standing(20.0), standoff_mm=20.0, from_standoff_mm=100.0)
 
