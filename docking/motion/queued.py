@@ -7,8 +7,6 @@ their ordinary ramp, everything harder their quick one, which ends with brakes a
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass, replace
-from enum import Enum
 
 import numpy as np
 
@@ -25,9 +23,10 @@ from docking.errors import (
 from docking.motion.arbiter import Arbiter, Mode, Reaction
 from docking.motion.monitors import Watch
 from docking.motion.playback import Playback
+from docking.motion.queued_move import Phase, QueuedMove
 from docking.motion.recorder import Recorder
-from docking.motion.start import require, require_here, share_of
-from docking.motion.stop_clock import StopClock
+from docking.motion.rhythm import Rhythm
+from docking.motion.start import newest, require, require_enabled, require_free, require_here, share_of
 from docking.motion.triggers import Finding, Trigger
 from docking.ports import QueuedPositioners
 from docking.types import Array, AxisState, Feedback, Identity, MoveResult, Plan, readonly
@@ -35,38 +34,12 @@ from docking.types import Array, AxisState, Feedback, Identity, MoveResult, Plan
 START_TOLERANCE_MM = 0.02
 STANDSTILL_MM = 0.002
 END_POLLS = 3
-END_S = 1e-6
 TRACE_PERIOD_S = 0.1
 BRAKE_S = 2.0
 TOLD_S = 0.5
 """In so long a stop has reached every controller that can be reached, and its end has been seen."""
-GOLDEN, SHARE = 0.618, 0.2
-"""During a move polls come up to this share of their period early, spread evenly."""
 RESET_S = 0.3
 """How long nothing may be found again after the controllers were told to forget their faults."""
-
-
-class _Phase(Enum):
-    """What the controllers were last told about a move."""
-
-    LOADED = 1
-    RUNNING = 2
-    HOLDING = 3
-
-
-@dataclass(eq=False)
-class _Move:
-    """A running move; `held`: the operator holds it."""
-
-    playback: Playback
-    recorder: Recorder
-    done: asyncio.Future[MoveResult]
-    clock: StopClock
-    held: bool = False
-    phase: _Phase = _Phase.LOADED
-
-    def ended(self, feedback: Feedback) -> bool:
-        return feedback.path_time_s >= self.playback.plan.duration_s - END_S
 
 
 class QueuedMotion:
@@ -79,17 +52,15 @@ class QueuedMotion:
         self._commanded: Array = np.zeros(len(self.axes))
         self._feedback: Feedback | None = None
         self._loaded: Playback | None = None
-        self._move: _Move | None = None
+        self._move: QueuedMove | None = None
         self._early: list[str] = []
         self._share = self._told_share = 1.0
         self._applied = Reaction.NONE
         self._deaf = self._slowing = False
         self._still = self._unasked = 0
         self._keeper: asyncio.Task[None] | None = None
-        self._sleeper: asyncio.Future[None] | None = None
-        self._cycled = asyncio.Event()
-        self._cycles, self._keeping, self._polled_s, self._phase = 0, False, 0.0, 0.0
-        positioners.on_lost = self._wake
+        self._rhythm = Rhythm(poll_s)
+        positioners.on_lost = self._rhythm.wake
 
     # the port ----------------------------------------------------------------------------------------------------
     async def connect(self) -> tuple[Identity, ...]:
@@ -98,7 +69,7 @@ class QueuedMotion:
     async def enable(self) -> Array:
         """Raises AxisUnreferenced, or the fault that is kept: `reset` comes first."""
         self.arbiter.require_referenced()
-        self._refuse()
+        self._require_free()
         await self._end_keeper()
         self.arbiter.enter(Mode.OFF)
         self._feedback = await self._bus.enable()
@@ -107,7 +78,7 @@ class QueuedMotion:
         self._early.clear()
         self._watch.watch_about(self._commanded)
         self.arbiter.enter(Mode.STANDING)
-        self._keeping, self._polled_s = True, asyncio.get_running_loop().time()
+        self._rhythm.begin()
         self._keeper = asyncio.get_running_loop().create_task(self._keep())
         return self._commanded
 
@@ -116,13 +87,13 @@ class QueuedMotion:
 
         Refused where the load cells show a part that is strained already; a relief is the plan for that.
         """
-        self._refuse()
+        self._require_free()
         require_here(plan, self._commanded, self._watch.driven, START_TOLERANCE_MM)
         self._loaded = None
         self._require_enabled()
         await self._bus.load(plan)
-        await self._next_cycle()
-        self._refuse()
+        await self._rhythm.next_cycle()
+        self._require_free()
         self._require_enabled()
         self._watch.watch_about(plan.q_mm[0], relief=plan.kind == "relief")
         require(self._watch.strained_before(self.feedback()))
@@ -130,7 +101,7 @@ class QueuedMotion:
         self._loaded = Playback(plan)
 
     async def start(self, plan_hash: str) -> MoveResult:
-        self._refuse()
+        self._require_free()
         playback, self._loaded = self._loaded, None
         if playback is None or playback.plan.plan_hash != plan_hash:
             raise PlanStale("motion", "this plan is not loaded")
@@ -138,12 +109,12 @@ class QueuedMotion:
         require(self._watch.changed_at_rest(self.feedback()))
         recorder = Recorder(self._watch, max(1, round(TRACE_PERIOD_S / self._poll_s)))
         self.arbiter.enter(Mode.MOVING)
-        self._move = move = _Move(playback, recorder, asyncio.get_running_loop().create_future(), StopClock())
+        self._move = move = QueuedMove(playback, recorder, asyncio.get_running_loop().create_future())
         self._slowing, self._still, self._unasked = False, 0, 0
         early, self._early = self._early, []
         for verb in early:
             self._obey(move, verb)
-        self._wake()
+        self._rhythm.wake()
         try:
             return await asyncio.shield(move.done)
         except asyncio.CancelledError:
@@ -157,9 +128,9 @@ class QueuedMotion:
             self._early.append(verb)
             return
         self._obey(self._move, verb)
-        self._wake()
+        self._rhythm.wake()
 
-    def _obey(self, move: _Move, verb: str) -> None:
+    def _obey(self, move: QueuedMove, verb: str) -> None:
         changed = None
         if verb == "resume" and self._feedback is not None:
             changed = self._watch.changed_at_rest(self._feedback)
@@ -176,12 +147,12 @@ class QueuedMotion:
         The controllers take a new rate at standstill only: a move in progress is held for it. Raises BadArgument.
         """
         self._share = share_of(percent)
-        self._wake()
+        self._rhythm.wake()
 
     def report(self, finding: Finding) -> None:
         """Something outside the axes asks for a reaction: judged and latched as what the monitors find."""
         self._raise(finding.trigger, finding.error)
-        self._wake()
+        self._rhythm.wake()
 
     async def reset(self, role: str) -> None:
         """Forget the fault that is kept, on a person's order; then the axes have to be enabled again. Moves nothing.
@@ -198,83 +169,39 @@ class QueuedMotion:
 
     def feedback(self) -> Feedback:
         """The newest read-back. Raises the fault that is kept."""
-        if self.arbiter.first is not None:
-            raise self.arbiter.first.error
-        if self._feedback is None:
-            raise PlanStale("motion", "the positioners are not enabled")
-        return self._feedback
+        return newest(self.arbiter, self._feedback)
 
     async def close(self) -> None:
-        if self._move is not None and self._keeping:
+        if self._move is not None and self._rhythm.running:
             self.request("stop")
             await asyncio.wait((self._move.done,))
         await self._end_keeper()
         await self._bus.close()
 
-    def _refuse(self) -> None:
-        """Raise what forbids that anything begins."""
-        if self.arbiter.first is not None:
-            raise self.arbiter.first.error
-        if self._move is not None:
-            raise PlanStale("motion", "a move is running")
+    def _require_free(self) -> None:
+        require_free(self.arbiter, moving=self._move is not None)
 
     def _require_enabled(self) -> None:
-        off = self._watch.power(self.feedback())
-        if off is not None:
-            raise off
-        if self.arbiter.mode is not Mode.STANDING:
-            raise PlanStale("motion", "the axes have to be enabled again")
+        require_enabled(self.arbiter, self._watch, self._feedback)
 
     # the keeper --------------------------------------------------------------------------------------------------
     async def _keep(self) -> None:
         try:
             while self._applied is not Reaction.HW:
-                await self._nap()
+                await self._rhythm.nap(moving=self._move is not None)
                 await self._cycle()
-                self._cycles += 1
-                self._cycled.set()
+                self._rhythm.cycled()
         except Exception as error:
             # Nobody polls any more: the controllers are told once, and miss the heartbeat afterwards. Whoever waits
             # for the move learns why, and so does everyone who asks later.
             self._raise(Trigger.DEFECT, _defect(error))
             await self._react()
             move, self._move = self._move, None
-            if move is not None and not move.done.done():
-                move.done.set_exception(error)
+            if move is not None:
+                move.fail(error)
             raise
         finally:
-            self._keeping = False
-            self._cycled.set()
-
-    async def _next_cycle(self) -> None:
-        """Wait for a read-back that is asked for after this call."""
-        self._wake()
-        # One cycle may be under way already.
-        due = self._cycles + 2
-        while self._keeping and self._cycles < due:
-            self._cycled.clear()
-            await self._cycled.wait()
-
-    async def _nap(self) -> None:
-        """Sleep until the next poll is due, or something is to be done.
-
-        A poll that took long brings the next one forward: the controllers count the time between two heartbeats.
-        """
-        loop = asyncio.get_running_loop()
-        self._sleeper = loop.create_future()
-        if self._move is not None:
-            # Never in step with the scans: the phase decides how old the path time is that a read-back shows.
-            self._phase = (self._phase + GOLDEN) % 1.0
-        timer = loop.call_at(self._polled_s + self._poll_s * (1.0 - SHARE * self._phase), self._wake)
-        try:
-            await self._sleeper
-        finally:
-            timer.cancel()
-        self._polled_s = loop.time()
-
-    def _wake(self) -> None:
-        if self._sleeper is not None and not self._sleeper.done():
-            self._sleeper.set_result(None)
+            self._rhythm.end()
 
     async def _end_keeper(self) -> None:
         if self._keeper is not None:
@@ -327,16 +254,16 @@ class QueuedMotion:
     def _at_rest(self) -> bool:
         return self._still >= END_POLLS and (self._applied is not Reaction.SBT or self._bus.braked)
 
-    async def _lead(self, move: _Move, feedback: Feedback) -> None:
+    async def _lead(self, move: QueuedMove, feedback: Feedback) -> None:
         """One command towards what operator and override ask for; the next read-back shows its effect."""
         wanted = not move.held and self._share > 0.0
-        if move.phase is _Phase.RUNNING:
+        if move.phase is Phase.RUNNING:
             if not wanted or self._share != self._told_share:
-                move.phase = _Phase.HOLDING
+                move.phase = Phase.HOLDING
                 await self._tell("hold")
         elif wanted and AxisState.STOPPING not in feedback.states and not move.ended(feedback):
-            verb = "run" if move.phase is _Phase.LOADED else "resume"
-            move.phase = _Phase.RUNNING
+            verb = "run" if move.phase is Phase.LOADED else "resume"
+            move.phase = Phase.RUNNING
             await self._tell(verb)
             move.playback.rate = self._told_share
 
@@ -438,8 +365,7 @@ class QueuedMotion:
         if self.arbiter.mode is Mode.MOVING:
             self.arbiter.enter(Mode.STANDING)
         if not move.done.done():
-            recorded = move.recorder.result(outcome, path_time_s, self._commanded, cause)
-            move.done.set_result(replace(recorded, stop=move.clock.times()))
+            move.done.set_result(move.result(outcome, path_time_s, self._commanded, cause))
 
 
 def _trigger_of(error: DockingError) -> Trigger:

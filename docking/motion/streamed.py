@@ -20,7 +20,7 @@ from docking.motion.monitors import Watch
 from docking.motion.playback import Playback
 from docking.motion.recorder import Recorder
 from docking.motion.standstill import Standstill
-from docking.motion.start import require, require_here, share_of
+from docking.motion.start import newest, require, require_enabled, require_free, require_here, share_of
 from docking.motion.stops import PlannedStop, planned_stop
 from docking.motion.streamed_move import StreamedMove
 from docking.motion.triggers import Finding, Trigger
@@ -75,7 +75,7 @@ class StreamedMotion:
     async def enable(self) -> Array:
         """Raises AxisUnreferenced, or the fault that is kept: `reset` comes first."""
         self.arbiter.require_referenced()
-        self._refuse()
+        self._require_free()
         self._end_ticks()
         self.arbiter.enter(Mode.OFF)
         feedback = await self._bus.enable()
@@ -96,13 +96,13 @@ class StreamedMotion:
         Refused where the part is strained already (MeasuredForceTrip, MeasuredWarpTrip, BallForceTrip, BallUnloaded);
         a relief is the plan for that.
         """
-        self._refuse()
+        self._require_free()
         require_here(plan, self._setpoint, self._watch.driven, START_TOLERANCE_MM)
         self._require_enabled()
         stop = planned_stop(plan, self._bus.a_quick_mm_s2, self._cycle_s)
         self._loaded = None
         await self._bus.arm_stops(stop.peak_mm_s, stop.t_stop_s)
-        self._refuse()
+        self._require_free()
         # Axes without a set-point stand where the component has taken them: the plan begins there.
         self._setpoint = readonly(np.where(self._watch.driven, self._setpoint, plan.q_mm[0]))
         self._history.extend([self._setpoint] * 2)
@@ -113,7 +113,7 @@ class StreamedMotion:
         self._loaded = Playback(plan, self._share), stop
 
     async def start(self, plan_hash: str) -> MoveResult:
-        self._refuse()
+        self._require_free()
         loaded, self._loaded = self._loaded, None
         if loaded is None or loaded[0].plan.plan_hash != plan_hash:
             raise PlanStale("motion", "this plan is not loaded")
@@ -173,11 +173,7 @@ class StreamedMotion:
 
     def feedback(self) -> Feedback:
         """The newest read-back. Raises the fault that is kept."""
-        if self.arbiter.first is not None:
-            raise self.arbiter.first.error
-        if self._feedback is None:
-            raise PlanStale("motion", "the positioners are not enabled")
-        return self._feedback
+        return newest(self.arbiter, self._feedback)
 
     async def close(self) -> None:
         if self._move is not None:
@@ -188,19 +184,11 @@ class StreamedMotion:
         await self._braking.cancel()
         await self._bus.close()
 
-    def _refuse(self) -> None:
-        """Raise what forbids that anything begins."""
-        if self.arbiter.first is not None:
-            raise self.arbiter.first.error
-        if self._move is not None:
-            raise PlanStale("motion", "a move is running")
+    def _require_free(self) -> None:
+        require_free(self.arbiter, moving=self._move is not None)
 
     def _require_enabled(self) -> None:
-        off = self._watch.power(self.feedback())
-        if off is not None:
-            raise off
-        if self.arbiter.mode is not Mode.STANDING:
-            raise PlanStale("motion", "the axes have to be enabled again")
+        require_enabled(self.arbiter, self._watch, self._feedback)
 
     def _obey(self, move: StreamedMove, verb: str) -> None:
         if verb == "stop":
@@ -221,7 +209,7 @@ class StreamedMotion:
         self._ticked.clear()
         if self._timer is not None:
             await self._ticked.wait()
-        self._refuse()
+        self._require_free()
 
     def _end_ticks(self) -> None:
         if self._timer is not None:
