@@ -307,6 +307,34 @@ class NoRedundancy(NotCongruent):
     code = 3015
 
 
+class MarkersTooFew(PoseError):
+    code = 3031
+
+
+class MarkersDisagree(PoseError):
+    code = 3032
+
+
+class MapNotBuilt(PoseError):
+    code = 3033
+
+
+class NotLocalised(PoseError):
+    code = 3031
+
+
+class OverlayUncertain(PoseError):
+    code = 3032
+
+
+class DegenerateTrajectory(PoseError):
+    code = 3033
+
+
+class DevicePairsDisagree(PoseError):
+    code = 3034
+
+
 # 4xxx files and arguments ----------------------------------------------------------------------------------------
 class ConfigError(DockingError):
     """Files and arguments."""
@@ -338,6 +366,22 @@ class BadArgument(ConfigError):
 
 class FileUnwritable(ConfigError):
     code = 4005
+
+
+class ExtraMissing(ConfigError):
+    code = 4006
+
+
+class BadTrajectory(ConfigError):
+    code = 4011
+
+
+class BadMesh(ConfigError):
+    code = 4012
+
+
+class FontMissing(ConfigError):
+    code = 4013
 
 
 # 5xxx planning and convergence -----------------------------------------------------------------------------------
