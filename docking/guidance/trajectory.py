@@ -36,7 +36,8 @@ class Trajectory:
 
     @staticmethod
     def of(stamped: list[tuple[float, Pose]]) -> Trajectory:
-        """The trajectory of poses with their times in s."""
+        """The trajectory of poses X_WK with their times in s, put in the order of time."""
+        stamped = sorted(stamped, key=lambda pair: pair[0])
         times = np.array([t_s for t_s, _ in stamped], dtype=np.float64)
         rotations = np.array([X.R for _, X in stamped], dtype=np.float64).reshape(-1, 3, 3)
         positions = np.array([X.t_mm for _, X in stamped], dtype=np.float64).reshape(-1, 3)
@@ -75,9 +76,7 @@ def read_tum(path: Path) -> Trajectory:
     rows = [_numbers(path, k, line) for k, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
     if not rows:
         raise BadTrajectory(str(path), "there is no pose in it", value="the file")
-    table = np.array(rows)
-    order = np.argsort(table[:, 0], kind="stable")
-    table = table[order]
+    table = np.array(sorted(rows))
     return Trajectory(table[:, 0], Rotation.from_quat(table[:, 4:]).as_matrix(), table[:, 1:4] * MM_PER_M)
 
 
@@ -110,7 +109,7 @@ def write_tum(trajectory: Trajectory, path: Path, comment: str = "t_s x_m y_m z_
 def same_moments(judged: Trajectory, truth: Trajectory) -> tuple[Array, Array]:
     """Rows of `judged` and of `truth` that belong together: for every pose of the shorter one, the nearest in time.
 
-    Pairs further apart than MAX_TIME_DIFFERENCE_S are no pairs. The rule is that of the tool evo, so that figures agree.
+    Pairs further apart than MAX_TIME_DIFFERENCE_S are no pairs. The tool evo has the same rule.
     """
     swap = len(truth) > len(judged)
     short, long = (judged, truth) if swap else (truth, judged)
