@@ -1,0 +1,66 @@
+"""Images of a scan: a folder of pictures or a video, grey, with names and times."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from docking.errors import FileUnreadable
+from docking.guidance.opencv import opencv
+from docking.guidance.types import Image
+
+SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"})
+FOLDER_FPS = 10.0
+
+
+class Picture(NamedTuple):
+    """One image: `name`, time in the scan `t_s`, grey `image` (h, w)."""
+
+    name: str
+    t_s: float
+    image: Image
+
+
+def pictures(source: Path, fps: float = FOLDER_FPS) -> Iterator[Picture]:
+    """The images of a folder in the order of their names (`fps` gives their times), of one image file, or of a video.
+
+    Raises FileUnreadable, ExtraMissing.
+    """
+    if source.is_dir():
+        files = sorted(path for path in source.iterdir() if path.suffix.lower() in SUFFIXES)
+        if not files:
+            raise FileUnreadable(str(source), "no image in this folder")
+        for i, path in enumerate(files):
+            yield Picture(path.name, i / fps, read_image(path))
+    elif source.suffix.lower() in SUFFIXES:
+        yield Picture(source.name, 0.0, read_image(source))
+    else:
+        yield from _video(source)
+
+
+def read_image(path: Path) -> Image:
+    """A grey image file. Raises FileUnreadable."""
+    cv2 = opencv()
+    image: Image | None = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise FileUnreadable(str(path), "not an image that OpenCV can read")
+    return image
+
+
+def _video(path: Path) -> Iterator[Picture]:
+    cv2 = opencv()
+    capture = cv2.VideoCapture(str(path))
+    try:
+        fps = capture.get(cv2.CAP_PROP_FPS) or FOLDER_FPS
+        number = 0
+        while True:
+            there, image = capture.read()
+            if not there:
+                break
+            yield Picture(f"{path.stem}-{number:05d}", number / fps, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+            number += 1
+        if number == 0:
+            raise FileUnreadable(str(path), "not a video that OpenCV can read")
+    finally:
+        capture.release()
