@@ -308,15 +308,15 @@ class NoRedundancy(NotCongruent):
 
 
 class MarkersTooFew(PoseError):
-    code = 3031
+    code = 3041
 
 
 class MarkersDisagree(PoseError):
-    code = 3032
+    code = 3042
 
 
 class MapNotBuilt(PoseError):
-    code = 3033
+    code = 3043
 
 
 class NotLocalised(PoseError):

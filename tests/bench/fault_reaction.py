@@ -74,8 +74,13 @@ class _Tap:
         self.on_lost: Callable[[str], None] = lambda reason: None
 
     async def open(self) -> None:
-        self._near.on_frames = lambda frames: self.on_frames(frames)
+        self._near.on_frames = self._hear
         await self._near.open()
+
+    def _hear(self, frames: list[CanFrame]) -> None:
+        """What the drives still had on the wire when the fault was injected would report it healthy again."""
+        if self.bus is None:
+            self.on_frames(frames)
 
     def send(self, frames: list[CanFrame]) -> None:
         if self.bus is None:
