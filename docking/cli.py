@@ -16,6 +16,7 @@ import click
 
 from docking.cli_devices import devices, monitor
 from docking.cli_fit import fit, study_screening
+from docking.cli_guide import guide
 from docking.cli_survey import layout, network
 from docking.errors import (
     EXIT_FAULT,
@@ -266,6 +267,7 @@ def study_dock(cells: tuple[Path, ...], as_json: bool, **options: Any) -> int:
 cli.add_command(fit)
 study.add_command(study_screening)
 cli.add_command(layout)
+cli.add_command(guide)
 cli.add_command(devices)
 cli.add_command(monitor)
 cli.add_command(network)
