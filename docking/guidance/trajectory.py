@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from docking.errors import BadTrajectory, DegenerateTrajectory, FileUnreadable, FileUnwritable
 from docking.types import Array, Pose
 
+Rows = NDArray[np.intp]
 Alignment = Literal["none", "se3", "sim3"]
 MM_PER_M = 1000.0
 MAX_TIME_DIFFERENCE_S = 0.01
@@ -106,7 +108,7 @@ def write_tum(trajectory: Trajectory, path: Path, comment: str = "t_s x_m y_m z_
         raise FileUnwritable(str(path), error.strerror or str(error)) from error
 
 
-def same_moments(judged: Trajectory, truth: Trajectory) -> tuple[Array, Array]:
+def same_moments(judged: Trajectory, truth: Trajectory) -> tuple[Rows, Rows]:
     """Rows of `judged` and of `truth` that belong together: for every pose of the shorter one, the nearest in time.
 
     Pairs further apart than MAX_TIME_DIFFERENCE_S are no pairs. The tool evo has the same rule.
@@ -119,12 +121,12 @@ def same_moments(judged: Trajectory, truth: Trajectory) -> tuple[Array, Array]:
     return (rows_short, rows_long) if swap else (rows_long, rows_short)
 
 
-def _nearest(sorted_s: Array, wanted_s: Array) -> Array:
+def _nearest(sorted_s: Array, wanted_s: Array) -> Rows:
     """Index (m,) of the entry of `sorted_s` that is nearest to each of `wanted_s` (m,)."""
     right = np.clip(np.searchsorted(sorted_s, wanted_s), 1, max(1, len(sorted_s) - 1))
     right = np.minimum(right, len(sorted_s) - 1)
     left = np.maximum(right - 1, 0)
-    result: Array = np.where(np.abs(sorted_s[left] - wanted_s) <= np.abs(sorted_s[right] - wanted_s), left, right)
+    result: Rows = np.where(np.abs(sorted_s[left] - wanted_s) <= np.abs(sorted_s[right] - wanted_s), left, right)
     return result
 
 
