@@ -109,7 +109,7 @@ class StreamedMotion:
         await self._next_tick()
         self._watch.watch_about(plan.q_mm[0], relief=plan.kind == "relief")
         require(self._watch.strained_before(self.feedback()))
-        self._quick_stop_s = stop.longest_s + QUICK_STOP_S
+        self._quick_stop_s = stop.t_stop_s + QUICK_STOP_S
         self._loaded = Playback(plan, self._share), stop
 
     async def start(self, plan_hash: str) -> MoveResult:

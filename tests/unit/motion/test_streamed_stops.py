@@ -117,12 +117,11 @@ def test_ramps_are_armed_in_proportion_before_every_move():
         await bench.motion.load(PLAN)
         ((peak, t_stop_s),) = bench.bus.armed
         largest = np.abs(np.diff(PLAN.q_mm, axis=0)).max(axis=0) / PLAN.period_s
-        assert (peak <= largest).all()
-        assert (peak >= 0.9 * largest).all()
+        np.testing.assert_allclose(peak, largest, rtol=1e-12)
         assert t_stop_s == pytest.approx(max(largest.max() / 200.0, CYCLE_S))
         stop = planned_stop(PLAN, bench.bus.a_quick_mm_s2, CYCLE_S)
         speed = np.abs(np.diff(PLAN.q_mm, axis=0)) / PLAN.period_s
-        assert (speed / (peak / t_stop_s) <= stop.longest_s).all(), "every axis is at rest by then"
+        assert (speed / (peak / t_stop_s) <= stop.t_stop_s * (1.0 + 1e-9)).all(), "every axis is at rest by then"
 
     on_bench(scenario)
 
@@ -148,7 +147,7 @@ def test_a_stop_on_the_path_that_does_not_end_becomes_a_quick_stop_then_silence(
                 break
         stop = planned_stop(PLAN, bench.bus.a_quick_mm_s2, CYCLE_S)
         assert quick_s == pytest.approx(1.5 / PLAN.rate_slew_per_s + 2 * CYCLE_S, abs=1.5 * CYCLE_S)
-        assert silent_s - quick_s == pytest.approx(stop.longest_s + 0.1, abs=2.0 * CYCLE_S)
+        assert silent_s - quick_s == pytest.approx(stop.t_stop_s + 0.1, abs=2.0 * CYCLE_S)
         result = await move
         assert result.result == "fault"
         assert isinstance(result.cause, StopOverdue)
