@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from docking import records
+from docking.activity import Activity
 from docking.approach import Approach, Station
 from docking.errors import (
     AmbiguousSet,
@@ -29,12 +30,11 @@ from docking.independent_points import IndependentPoints
 from docking.kinematics import ball_reactions_n, figure_residual_mm, pose_from_axes, sink_mm
 from docking.motion.settle import settle
 from docking.motion.weighing import weigh
-from docking.permissives import Permissives
 from docking.planning import Action, PlanRequest, check_correction, make_plan, retreat_plan
 from docking.ports import Journal, Motion, Operator
 from docking.pose import fit_pose, screen
 from docking.procedure_settings import ProcedureSettings
-from docking.progress import Progress, stop_of
+from docking.progress import Progress
 from docking.state import Effect, Event
 from docking.survey import Survey
 from docking.types import Array, Fit, Plan
@@ -46,7 +46,7 @@ UNSEEN = (TargetLost, TooFewPoints, DegenerateTargets)
 """The component cannot be measured, as with a blocked line of sight: a person clears it, or retreats without a fit."""
 
 
-class Procedure:
+class Procedure(Activity[Progress]):
     """The effects of the state table, and what is known while a docking runs."""
 
     def __init__(
@@ -58,10 +58,9 @@ class Procedure:
         journal: Journal,
         operator: Operator,
     ) -> None:
+        super().__init__(motion, journal, operator, survey.clock, Progress())
         self._settings, self._approach, self._survey = settings, approach, survey
-        self.motion, self.journal, self.operator = motion, journal, operator
-        self.progress = Progress()
-        self._permissives = Permissives(motion, journal, operator)
+        self._devices = (survey.tracker,)
         self._unseen: DockingError | None = None
         self._independent = IndependentPoints(survey, journal, settings.target_residual_mm, self._set_aside)
         self.effects: dict[Effect, Callable[[], Awaitable[Event]]] = {
@@ -83,32 +82,6 @@ class Procedure:
     def stages(self) -> tuple[str, ...]:
         """Names of the stations, in order."""
         return tuple(station.name for station in self._approach.stations)
-
-    def alarm(self, error: DockingError) -> None:
-        """Keep an error in the journal and tell the operator."""
-        alarm = error.alarm(self._survey.clock(), stop=stop_of(self.progress.result, error))
-        self.progress.alarms.append(alarm)
-        self.journal.write("alarm", records.alarm_record(alarm))
-        self.operator.notify("alarm", code=alarm.code, error=error)
-
-    async def close(self) -> None:
-        """Release the devices; what goes wrong is told, and the rest is still released."""
-        for close in (self.motion.close, self._survey.tracker.close):
-            try:
-                await close()
-            except DockingError as error:
-                self.alarm(error)
-
-    async def _connect(self) -> Event:
-        found = (await self._survey.tracker.connect(), *await self.motion.connect())
-        for identity in found:
-            self.journal.write("identity", vars(identity))
-        self.operator.notify("devices", count=len(found))
-        return Event.CONNECTED
-
-    async def _enable(self) -> Event:
-        self.progress.commanded_mm = await self.motion.enable()
-        return Event.ENABLED
 
     async def _locate(self) -> Event:
         self._take_temperatures()

@@ -18,28 +18,34 @@ class Executed:
 
 
 @dataclass
-class Progress:
+class Standing:
+    """Where the axes of any run stand, how its last move ended, and what went wrong."""
+
+    commanded_mm: Array | None = None
+    plan: Plan | None = None
+    result: MoveResult | None = None
+    alarms: list[Alarm] = field(default_factory=list)
+
+
+@dataclass
+class Progress(Standing):
     """Where a docking stands. `way` is what a retreat would go back: the moves made, oldest first."""
 
     stage: int = 0
     corrections: int = 0
     passes: int = 0
     moves: int = 0
-    commanded_mm: Array | None = None
     X_WC: Fit | None = None
     fitted_at_s: float = float("nan")
     errors: FeatureErrors | None = None
-    plan: Plan | None = None
     kind: str = "align"
     stood_at: int = 0
     tared: bool = False
     way: list[Executed] = field(default_factory=list)
     history: list[Attempt] = field(default_factory=list)
-    alarms: list[Alarm] = field(default_factory=list)
     rejected: set[str] = field(default_factory=set)
     max_residual_mm: float = 0.0
     max_internal_force_n: float = 0.0
-    result: MoveResult | None = None
 
     def moved(self, plan: Plan, result: MoveResult) -> None:
         """Keep how a move ended. A move along the way is added to it; one back along it is taken off, and leaves

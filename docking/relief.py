@@ -8,23 +8,23 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from docking import records
-from docking.errors import DockingError, ForceRose, ForeignForce, NotRelieved, PlanStale
+from docking.activity import Activity
+from docking.errors import ForceRose, ForeignForce, NotRelieved, PlanStale
 from docking.kinematics import Positioners
 from docking.motion.settle import SettleSettings
 from docking.motion.weighing import weigh
-from docking.permissives import Permissives
 from docking.planning import PlanSettings
 from docking.planning.relief import ReliefSettings, Scales, StepRequest, Strain, Tare, Weighing, relief_plan
 from docking.ports import Journal, Motion, Operator
-from docking.progress import stop_of
+from docking.progress import Standing
 from docking.state import Effect, Event
-from docking.types import Alarm, Array, MoveResult, Plan
+from docking.types import Array, MoveResult, Plan
 
 GUARD_READINGS, GUARD_PAUSE_S = 2, 0.02
 """Readings that the guard of a running step averages, as often as load cells report."""
@@ -46,7 +46,7 @@ class ReliefRun:
 
 
 @dataclass
-class ReliefProgress:
+class ReliefProgress(Standing):
     """Where a relief stands: the strain before the first step, now, and the step that is planned."""
 
     steps: int = 0
@@ -55,13 +55,9 @@ class ReliefProgress:
     first: Strain | None = None
     strain: Strain | None = None
     weighing: Weighing | None = None
-    plan: Plan | None = None
-    commanded_mm: Array | None = None
-    result: MoveResult | None = None
-    alarms: list[Alarm] = field(default_factory=list)
 
 
-class Relief:
+class Relief(Activity[ReliefProgress]):
     """The effects of a relief run; the same interface to `docking.cell.Cell` as a docking's procedure."""
 
     def __init__(
@@ -72,41 +68,14 @@ class Relief:
         operator: Operator,
         clock: Callable[[], float],
     ) -> None:
-        self.run, self._clock = run, clock
-        self.motion, self.journal, self.operator = motion, journal, operator
-        self.progress = ReliefProgress()
-        self._permissives = Permissives(motion, journal, operator)
+        super().__init__(motion, journal, operator, clock, ReliefProgress())
+        self.run = run
         self.effects: dict[Effect, Callable[[], Awaitable[Event]]] = {
             Effect.CONNECT: self._connect,
             Effect.ENABLE: self._enable,
             Effect.WEIGH: self._weigh,
             Effect.STEP: self._step,
         }
-
-    def alarm(self, error: DockingError) -> None:
-        """Keep an error in the journal and tell the operator."""
-        alarm = error.alarm(self._clock(), stop=stop_of(self.progress.result, error))
-        self.progress.alarms.append(alarm)
-        self.journal.write("alarm", records.alarm_record(alarm))
-        self.operator.notify("alarm", code=alarm.code, error=error)
-
-    async def close(self) -> None:
-        """Release the devices; what goes wrong is told."""
-        try:
-            await self.motion.close()
-        except DockingError as error:
-            self.alarm(error)
-
-    async def _connect(self) -> Event:
-        found = await self.motion.connect()
-        for identity in found:
-            self.journal.write("identity", vars(identity))
-        self.operator.notify("devices", count=len(found))
-        return Event.CONNECTED
-
-    async def _enable(self) -> Event:
-        self.progress.commanded_mm = await self.motion.enable()
-        return Event.ENABLED
 
     async def _weigh(self) -> Event:
         """Judge the strain that is left, and what the last step did; then have the next step asked for."""
