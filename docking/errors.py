@@ -335,6 +335,38 @@ class DevicePairsDisagree(PoseError):
     code = 3034
 
 
+class SensorFrozen(PoseError):
+    code = 3051
+
+
+class TimeJumped(PoseError):
+    code = 3052
+
+
+class SensorSaturated(PoseError):
+    code = 3053
+
+
+class PointsSwapped(PoseError):
+    code = 3054
+
+
+class LeverArmWrong(PoseError):
+    code = 3055
+
+
+class ReferenceShifted(PoseError):
+    code = 3056
+
+
+class TrackingLost(PoseError):
+    code = 3057
+
+
+class AttitudeUnknown(PoseError):
+    code = 3058
+
+
 # 4xxx files and arguments ----------------------------------------------------------------------------------------
 class ConfigError(DockingError):
     """Files and arguments."""
@@ -382,6 +414,10 @@ class BadMesh(ConfigError):
 
 class FontMissing(ConfigError):
     code = 4013
+
+
+class BadRecording(ConfigError):
+    code = 4021
 
 
 # 5xxx planning and convergence -----------------------------------------------------------------------------------
