@@ -1,0 +1,218 @@
+"""One image -> pose of its camera in the cell, or a named refusal: the library that commands and services call.
+
+    image -> features -> key-frames alike (bag of words) -> matches -> PnP with RANSAC -> guided search -> robust pose
+
+With a hint (the pose of the frame before) the search begins at the guided search. A pose is given only with enough
+points that agree, spread over the image, and each says where it is from: `map` or `marker`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from docking.errors import BadArgument, NotLocalised
+from docking.guidance import guided
+from docking.guidance.features import Features, extract
+from docking.guidance.opencv import opencv
+from docking.guidance.pose_only import CameraFit, Sights, refine, seen_sigma_mm
+from docking.guidance.types import ArMap, Camera, Image
+from docking.guidance.vocabulary import Bags, bags_of, train
+from docking.types import Array, Pose
+
+Source = Literal["map", "marker"]
+Rows = NDArray[np.intp]
+_MOST_SEARCHES = 5
+_GROWTH = 1.03
+"""A search that finds this many times the points of the one before is followed by another."""
+COVERAGE = 2.0
+"""Predicted errors are this many sigmas."""
+
+
+@dataclass(frozen=True)
+class LocaliseSettings:
+    """What makes a pose believable, and how far it is searched.
+
+    `map_sigma_mm` is the least standard deviation of a mapped place; the map's own figure counts where it is larger.
+    """
+
+    candidates: int = 8
+    least_matches: int = 15
+    least_points: int = 40
+    least_share: float = 0.15
+    least_features: int = 200
+    radius_px: float = 8.0
+    ransac_px: float = 4.0
+    most_rms_px: float = 4.0
+    map_sigma_mm: float = 1.0
+    limit_mm: float = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class Localised:
+    """The camera in the cell: X_WC, `cov` (6, 6) of [rotation rad, shift mm] in the camera's frame.
+
+    `points` map points agree out of `expected` that the pose should see; `rms_px` of those; `depth_mm` their median
+    depth. `map_sigma_mm` is the standard deviation of mapped places, the same for neighbouring points.
+    `feature_rows`, `point_rows` say which features of the image are which points of the map.
+    """
+
+    X_WC: Pose
+    cov: Array
+    source: Source
+    points: int
+    expected: int
+    rms_px: float
+    depth_mm: float
+    map_sigma_mm: float
+    camera: Camera
+    features: Features | None = None
+    feature_rows: Rows = field(default_factory=lambda: np.zeros(0, np.intp))
+    point_rows: Rows = field(default_factory=lambda: np.zeros(0, np.intp))
+
+    def predicted_error_mm(self, p_W_mm: Array | None = None) -> float:
+        """How far off a point of the cell may be drawn (COVERAGE sigmas, mm at its distance, across the line of sight).
+
+        Without a point: at the median depth of the points seen, on the optical axis.
+        """
+        p_C = np.array([0.0, 0.0, self.depth_mm]) if p_W_mm is None else self.X_WC.inverse().apply(p_W_mm)
+        seen = seen_sigma_mm(self.cov, p_C)
+        return COVERAGE * float(np.hypot(seen, self.map_sigma_mm))
+
+    @property
+    def sigma_mm(self) -> float:
+        """Standard deviation of the camera's position, mm: the largest of all directions."""
+        return float(np.hypot(np.sqrt(np.linalg.eigvalsh(self.cov[3:, 3:])[-1]), self.map_sigma_mm))
+
+
+@dataclass(frozen=True, eq=False)
+class Indexed:
+    """A map made ready for looking things up."""
+
+    ar_map: ArMap
+    bags: Bags
+    looks: guided.Looks
+
+
+def indexed(ar_map: ArMap) -> Indexed:
+    """Train the vocabulary on the map's descriptors and index its key-frames."""
+    frames = [frame.descriptors for frame in ar_map.keyframes]
+    return Indexed(ar_map, bags_of(train(np.concatenate(frames)), frames), guided.looks(ar_map))
+
+
+class Localiser:
+    """Localises images in one map. `camera` is that of the images (default: the camera the map was made with)."""
+
+    def __init__(
+        self, ar_map: ArMap | Indexed, camera: Camera | None = None, settings: LocaliseSettings | None = None
+    ) -> None:
+        self.index = ar_map if isinstance(ar_map, Indexed) else indexed(ar_map)
+        self.camera = camera or self.index.ar_map.camera
+        self.settings = settings or LocaliseSettings()
+
+    @property
+    def ar_map(self) -> ArMap:
+        """The map that is looked up; in the frame of the cell, mm."""
+        return self.index.ar_map
+
+    def localise(self, image: Image, hint: Pose | None = None) -> Localised:
+        """The pose of one image (h, w) or (h, w, 3). Raises NotLocalised with the cause, BadArgument, ExtraMissing."""
+        return self.locate(self.features(image), hint)
+
+    def features(self, image: Image) -> Features:
+        """The features of an image of this camera, if worth a search. Raises NotLocalised, BadArgument."""
+        size, wanted = image.shape[1::-1], (self.camera.width_px, self.camera.height_px)
+        if size != wanted:
+            raise BadArgument(
+                "image", "the camera's calibration is for another size", value=str(size), limit=str(wanted)
+            )
+        features = extract(image)
+        if len(features.keypoints_px) < self.settings.least_features:
+            cause = "the image shows too few features (dark, blurred or bare)"
+            raise NotLocalised("image", cause, value=len(features.keypoints_px), limit=self.settings.least_features)
+        return features
+
+    def locate(self, features: Features, hint: Pose | None = None) -> Localised:
+        """The pose of an image from its features: near the hint first, then anywhere in the map."""
+        if hint is not None:
+            try:
+                return self._settled(features, hint)
+            except NotLocalised:
+                pass  # The camera may have been carried elsewhere: the whole map is searched.
+        return self._anywhere(features)
+
+    def _anywhere(self, features: Features) -> Localised:
+        first: NotLocalised | None = None
+        for row in self.index.bags.alike(features.descriptors, self.settings.candidates):
+            try:
+                return self._settled(features, self._from_frame(features, row))
+            except NotLocalised as error:
+                first = first or error
+        raise first or NotLocalised(
+            "image", "nothing in the map looks like it", value=0, limit=self.settings.least_matches
+        )
+
+    def _from_frame(self, features: Features, row: int) -> Pose:
+        """X_WC by PnP on the matches with one key-frame."""
+        frame = self.ar_map.keyframes[row]
+        known = np.flatnonzero(frame.landmarks >= 0)
+        matcher = opencv().BFMatcher(opencv().NORM_HAMMING, crossCheck=True)
+        pairs = matcher.match(features.descriptors, frame.descriptors[known]) if len(known) else ()
+        close = [(m.queryIdx, known[m.trainIdx]) for m in pairs if m.distance <= guided.MOST_BITS]
+        if len(close) < self.settings.least_matches:
+            raise self._refused("nothing in the map looks like it", len(close), self.settings.least_matches)
+        mine, theirs = np.array(close, dtype=np.intp).T
+        sights = guided.sights(self.ar_map, features, mine, frame.landmarks[theirs].astype(np.intp))
+        return self._pnp(sights)
+
+    def _pnp(self, sights: Sights) -> Pose:
+        cv2, s = opencv(), self.settings
+        xy = self.camera.undistort(sights.pixels)
+        good, rotvec, shift, inside = cv2.solvePnPRansac(
+            sights.points_mm, xy, np.eye(3), None, iterationsCount=300, confidence=0.999,
+            reprojectionError=s.ransac_px / self.camera.fx_px, flags=cv2.SOLVEPNP_AP3P,
+        )  # fmt: skip
+        if not good or inside is None or len(inside) < s.least_matches:
+            count = 0 if inside is None else len(inside)
+            raise self._refused("what looks alike is not in the same place", count, s.least_matches)
+        X_CW = Pose(cv2.Rodrigues(rotvec)[0], shift.ravel())
+        return refine(self.camera, X_CW.inverse(), sights.where(inside.ravel())).X_WC
+
+    def _settled(self, features: Features, X_WC: Pose) -> Localised:
+        """Guided search and robust pose, wide and then narrow; judged. Raises NotLocalised."""
+        found = 0
+        for radius in (2.0 * self.settings.radius_px, *[self.settings.radius_px] * _MOST_SEARCHES):
+            wanted = guided.visible(self.ar_map, self.index.looks, self.camera, X_WC)
+            rows, points = guided.search(self.ar_map, wanted, features, radius)
+            if len(rows) < self.settings.least_matches:
+                raise self._refused("the map is not seen where it should be", len(rows), self.settings.least_points)
+            fit = refine(self.camera, X_WC, guided.sights(self.ar_map, features, rows, points))
+            X_WC, before = fit.X_WC, found
+            found = int(np.count_nonzero(fit.inside))
+            if radius == self.settings.radius_px and found <= _GROWTH * before:
+                break
+        return self._judged(features, rows, points, fit, len(wanted.points))
+
+    def _judged(self, features: Features, rows: Rows, points: Rows, fit: CameraFit, expected: int) -> Localised:
+        """The pose, if enough points agree. Every comparison is written so that NaN refuses."""
+        s, inside = self.settings, fit.inside
+        count = int(np.count_nonzero(inside))
+        if not count >= s.least_points:
+            raise self._refused("too few points agree", count, s.least_points)
+        if not count >= s.least_share * expected:
+            raise self._refused("most of what should be seen is not", count, int(s.least_share * expected))
+        if not fit.rms_px <= s.most_rms_px:
+            raise self._refused(f"points agree only within {fit.rms_px:.1f} px", count, s.least_points)
+        p_C = fit.X_WC.inverse().apply(self.ar_map.points_mm[points[inside]])
+        depth = float(np.median(p_C[:, 2]))
+        sigma = max(s.map_sigma_mm, self.ar_map.quality.marker_rms_mm or 0.0)
+        return Localised(
+            fit.X_WC, fit.cov, "map", count, expected, fit.rms_px, depth, sigma, self.camera,
+            features, rows[inside], points[inside],
+        )  # fmt: skip
+
+    def _refused(self, cause: str, count: int, needed: int) -> NotLocalised:
+        return NotLocalised("image", cause, value=count, limit=needed)
