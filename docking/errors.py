@@ -228,6 +228,10 @@ class AxisUnreferenced(MotionError):
     code = 2134
 
 
+class LoadUnexpected(MotionError):
+    code = 2135
+
+
 class EmergencyStop(MotionError):
     code = 2141
 
@@ -333,6 +337,10 @@ class DegenerateTrajectory(PoseError):
 
 class DevicePairsDisagree(PoseError):
     code = 3034
+
+
+class MapFrameDiffers(PoseError):
+    code = 3035
 
 
 class SensorFrozen(PoseError):

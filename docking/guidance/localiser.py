@@ -56,7 +56,8 @@ class Localised:
     """The camera in the cell: X_WC, `cov` (6, 6) of [rotation rad, shift mm] in the camera's frame.
 
     `points` map points agree out of `expected` that the pose should see; `rms_px` of those; `depth_mm` their median
-    depth. `map_sigma_mm` is the standard deviation of mapped places, the same for neighbouring points.
+    depth. `map_sigma_mm` is the standard deviation of mapped places, shared by neighbouring points; `generation` is 0
+    where the points were in the map as built, and grows with those that tracking added.
     `feature_rows`, `point_rows` say which features of the image are which points of the map.
     """
 
@@ -68,6 +69,7 @@ class Localised:
     rms_px: float
     depth_mm: float
     map_sigma_mm: float
+    generation: float
     camera: Camera
     features: Features | None = None
     feature_rows: Rows = field(default_factory=lambda: np.zeros(0, np.intp))
@@ -90,17 +92,19 @@ class Localised:
 
 @dataclass(frozen=True, eq=False)
 class Indexed:
-    """A map made ready for looking things up."""
+    """A map made ready for looking things up. `generation` (m,) of its points: 0 as built, see `extension`."""
 
     ar_map: ArMap
     bags: Bags
     looks: guided.Looks
+    generation: Array
 
 
 def indexed(ar_map: ArMap) -> Indexed:
     """Train the vocabulary on the map's descriptors and index its key-frames."""
     frames = [frame.descriptors for frame in ar_map.keyframes]
-    return Indexed(ar_map, bags_of(train(np.concatenate(frames)), frames), guided.looks(ar_map))
+    bags = bags_of(train(np.concatenate(frames)), frames)
+    return Indexed(ar_map, bags, guided.looks(ar_map), np.zeros(len(ar_map.points_mm)))
 
 
 class Localiser:
@@ -208,10 +212,11 @@ class Localiser:
             raise self._refused(f"points agree only within {fit.rms_px:.1f} px", count, s.least_points)
         p_C = fit.X_WC.inverse().apply(self.ar_map.points_mm[points[inside]])
         depth = float(np.median(p_C[:, 2]))
-        sigma = max(s.map_sigma_mm, self.ar_map.quality.marker_rms_mm or 0.0)
+        generation = float(np.mean(self.index.generation[points[inside]]))
+        sigma = max(s.map_sigma_mm, self.ar_map.quality.marker_rms_mm or 0.0) * float(np.sqrt(1.0 + generation))
         return Localised(
-            fit.X_WC, fit.cov, "map", count, expected, fit.rms_px, depth, sigma, self.camera,
-            features, rows[inside], points[inside],
+            fit.X_WC, fit.cov, "map", count, expected, fit.rms_px, depth, sigma, generation,
+            self.camera, features, rows[inside], points[inside],
         )  # fmt: skip
 
     def _refused(self, cause: str, count: int, needed: int) -> NotLocalised:
