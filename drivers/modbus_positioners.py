@@ -122,6 +122,7 @@ class ModbusPositioners:
 
     async def enable(self) -> Feedback:
         """Enable the driven axes where they stand; EnableFailed names a PLC that is in fault or does not follow."""
+        self._require_up()
         settings = self._settings()
         async with self._alone:
             await self._reconnect()
@@ -134,6 +135,10 @@ class ModbusPositioners:
             await self._all(plc.reach(ENABLE_S, "enabled", "held", "done") for plc in self._plcs)
             self._told_quick_stop = False
             return self._feedback()
+
+    def _require_up(self) -> None:
+        if not self._plcs:
+            raise LinkLost(f"positioner {self._cell.positioners[0].name}", "not brought up")
 
     async def _reconnect(self) -> None:
         """On request only: whatever has lost its connection is proved anew."""
@@ -150,6 +155,9 @@ class ModbusPositioners:
             raise BadArgument(
                 "plan", "axes or period differ from the cell's", value=plan.period_s, limit=self.segment_s
             )
+        if not np.isfinite(plan.q_mm).all():
+            raise BadArgument("plan", "a position is no number", value=float("nan"))
+        self._require_up()
         async with self._alone:
             await self._all(plc.command("stop") for plc in self._plcs)
             await self._all(plc.reach(self._bus.ramp_s + ENABLE_S, "enabled") for plc in self._plcs)
@@ -185,6 +193,7 @@ class ModbusPositioners:
         """Playback rate (over 0, to 1) from the next run or resume on; path time must stand still."""
         if not 0.0 < rate <= 1.0:
             raise BadArgument("rate", "over 0, at most 1", value=rate, limit=1.0)
+        self._require_up()
         async with self._alone:
             self._rate = rate
             await self._set_motion()
@@ -219,6 +228,7 @@ class ModbusPositioners:
         """
         if verb not in VERBS:
             raise BadArgument("verb", f"one of {', '.join(VERBS)}", value=verb)
+        self._require_up()
         async with self._alone:
             self._told_quick_stop = verb == "quick-stop" or self._told_quick_stop
             if verb in ("stop", "quick-stop"):
@@ -245,6 +255,7 @@ class ModbusPositioners:
         stands still, SegmentRejected when a PLC rejects a segment. With `surviving` a PLC that fails is only shown as
         old, by its `age_cycles`.
         """
+        self._require_up()
         async with self._alone:
             cycles = [self._cycle(plc, watch) for plc, watch in zip(self._plcs, self._watches, strict=True)]
             if surviving:

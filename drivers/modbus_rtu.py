@@ -17,6 +17,7 @@ from drivers.modbus_requests import EXCEPTIONS, READS, WRITE, RegisterUnit
 
 CHARACTER_BITS = 11
 """A start bit, eight data bits, a parity or a second stop bit, a stop bit: the longest character in use."""
+LONGEST_BYTES = 256
 FASTEST_GAP_S = 0.00175
 FASTEST_BAUD = 19200
 """Above this speed the gap stays as it is."""
@@ -72,6 +73,8 @@ class RtuLine:
             if not self.is_open:
                 await self._link.open()
                 self.is_open = True
+                # Whoever used the line before may have left a request behind that is still to be answered.
+                self._free_s = asyncio.get_running_loop().time() + self._longest_s()
 
     def leave(self, user: RtuUnit) -> None:
         """`user` is done with the line; the last one closes it."""
@@ -83,7 +86,11 @@ class RtuLine:
 
     def distrust(self) -> None:
         """What answered was not who was asked: let everything run out before the next request."""
-        self._free_s = asyncio.get_running_loop().time() + self._timeout_s
+        self._free_s = asyncio.get_running_loop().time() + self._longest_s()
+
+    def _longest_s(self) -> float:
+        """How long a unit may still be answering."""
+        return self._timeout_s + CHARACTER_BITS * LONGEST_BYTES / self._baud
 
     async def ask(self, frame: bytes, reply_bytes: int) -> bytes:
         """Send `frame` (unit to data), return the reply of as many bytes, or an exception reply, without its CRC.

@@ -6,19 +6,17 @@ A file lists events; each names a device, one of its faults, when it happens and
 from __future__ import annotations
 
 import asyncio
-import json
-import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from docking.config.base import Model, NonNegative, Positive
-from docking.errors import ConfigInvalid, FileUnreadable
 from sim.fault_book import Fault, FaultBook
+from sim.toml_model import read_toml
 
 LOOK_S = 0.005
 """How often a move is looked at while an event waits for a place on its path."""
@@ -72,24 +70,7 @@ class ScenarioFile(Model):
 
 def load_scenario(path: Path) -> ScenarioFile:
     """Read a scenario. Raises FileUnreadable, ConfigInvalid with all problems."""
-    try:
-        data = tomllib.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise FileUnreadable(str(path), (error.strerror or str(error)).lower()) from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise FileUnreadable(str(path), str(error)) from error
-    try:
-        # JSON mode is strict about types yet takes arrays as tuples, which TOML cannot spell otherwise.
-        return ScenarioFile.model_validate_json(json.dumps(data))
-    except ValidationError as error:
-        problems = [f"{_key(item['loc'])}: {item['msg']}" for item in error.errors(include_url=False)]
-        raise ConfigInvalid(str(path), tuple(dict.fromkeys(problems))) from error
-    except (TypeError, ValueError) as error:
-        raise ConfigInvalid(str(path), (str(error),)) from error
-
-
-def _key(loc: tuple[int | str, ...]) -> str:
-    return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc).lstrip(".")
+    return read_toml(path, ScenarioFile)
 
 
 @dataclass(frozen=True)

@@ -6,18 +6,16 @@ Every unmodelled error is one named group with its own size; `errors` holds one 
 
 from __future__ import annotations
 
-import json
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, field_validator
 
 from docking.config.base import Model, Name, NonNegative, Positive
-from docking.errors import ConfigInvalid, FileUnreadable
 from docking.types import Array
+from sim.toml_model import read_toml
 
 ERROR_NAMES: tuple[str, ...] = (
     "nominal_nests",
@@ -289,20 +287,7 @@ class TruthFile(Model):
 
 def load_truth(path: Path) -> TruthFile:
     """Read NAME.sim.toml. Raises FileUnreadable or ConfigInvalid (all problems at once)."""
-    try:
-        data = tomllib.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise FileUnreadable(str(path), (error.strerror or str(error)).lower()) from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise FileUnreadable(str(path), str(error)) from error
-    try:
-        # JSON mode is strict about types yet takes arrays as tuples, which TOML cannot spell otherwise.
-        return TruthFile.model_validate_json(json.dumps(data))
-    except ValidationError as error:
-        problems = tuple(
-            f"{'.'.join(str(part) for part in item['loc'])}: {item['msg']}" for item in error.errors(include_url=False)
-        )
-        raise ConfigInvalid(str(path), problems) from error
+    return read_toml(path, TruthFile)
 
 
 class Draws:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import struct
 from collections.abc import Callable
 
@@ -34,6 +35,7 @@ class SdoClient:
     ) -> None:
         self.where, self.node, self.deadline_s = where, node, deadline_s
         self.stray = 0
+        self._late: asyncio.Event | None = None
         self._send, self._abort_text = send, abort_text
         self._busy = asyncio.Lock()
         self._answer: asyncio.Future[SdoReply] | None = None
@@ -44,7 +46,11 @@ class SdoClient:
         reply = codec.parse_sdo(data)
         wanted = self._answer
         if wanted is None or wanted.done() or (reply.address is not None and reply.address != self._expected):
-            self.stray += 1
+            if self._late is not None and not self._late.is_set():
+                # The answer to a request that was given up: no second device.
+                self._late.set()
+            else:
+                self.stray += 1
             return
         wanted.set_result(reply)
 
@@ -94,6 +100,8 @@ class SdoClient:
 
     async def _ask(self, entry: ObjectEntry, request: bytes) -> SdoReply:
         """Send one request frame and wait for its answer."""
+        if self._late is not None:
+            await self._let_come(self._late)
         self._answer = asyncio.get_running_loop().create_future()
         self._expected = (entry.index, entry.sub)
         try:
@@ -103,12 +111,22 @@ class SdoClient:
         except TimeoutError as error:
             self._abort(entry, _ABORT_TIMEOUT)
             raise DeviceSilent(self.where, f"node {self.node}, object {entry.label}", limit=self.deadline_s) from error
+        except asyncio.CancelledError:
+            self._late = asyncio.Event()
+            raise
         finally:
             self._answer = None
         if reply.kind == "abort":
             cause = f"object {entry.label}: {self._abort_text(reply.code)}"
             raise DeviceRefused(self.where, cause, value=f"{reply.code:08X}h")
         return reply
+
+    async def _let_come(self, late: asyncio.Event) -> None:
+        """Let the answer to a request that was given up come first: a segment does not say what it belongs to."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(self.deadline_s):
+                await late.wait()
+        self._late = None
 
     def _check_segment(self, entry: ObjectEntry, reply: SdoReply, kind: str, toggle: int) -> None:
         if reply.kind != kind:

@@ -19,6 +19,7 @@ from sim.plc.modbus_tcp import ModbusTcpConnection
 from sim.plc.playback import Point
 from sim.plc.positioner import SCAN_S, Lines, PositionerPlc
 from sim.plc.registers import AXES, State
+from sim.plc.reply_faults import ReplyFaults
 from sim.plc.sensors import PlantView, Readings, Sensors
 from sim.wires.pacing import DeviceEnd
 
@@ -66,6 +67,7 @@ class PlcGroup:
         self._timer: asyncio.TimerHandle | None = None
         self._servers: list[asyncio.AbstractServer] = []
         self._connections: set[ModbusTcpConnection] = set()
+        self.faults = {p.name: ReplyFaults() for p in cell.positioners}
 
     async def serve(self, addresses: Mapping[str, Address] | None = None) -> dict[str, Address]:
         """Start scanning and listen; return the address of every positioner.
@@ -100,14 +102,22 @@ class PlcGroup:
         units = {p.unit or 1: plc for p, plc in zip(self._cell.positioners, self.plcs, strict=True)}
         self._due_s = self._before_s = self._loop.time()
         self._schedule()
-        return ModbusRtuLine(units, end, baud, self._loop)
+        return ModbusRtuLine(units, end, baud, self._loop, faults=self._faults_of(units))
 
     async def _listen(self, address: Address, units: Mapping[int, PositionerPlc]) -> asyncio.Server:
         names = [p.name for p, plc in zip(self._cell.positioners, self.plcs, strict=True) if plc in units.values()]
-        hear = partial(self._hear, "+".join(names))
-        server = await self._loop.create_server(lambda: ModbusTcpConnection(units, self._connections, hear), *address)
+        hear, faults = partial(self._hear, "+".join(names)), self._faults_of(units)
+
+        def connection() -> ModbusTcpConnection:
+            return ModbusTcpConnection(units, self._connections, hear, faults)
+
+        server = await self._loop.create_server(connection, *address)
         self._servers.append(server)
         return server
+
+    def _faults_of(self, units: Mapping[int, PositionerPlc]) -> dict[int, ReplyFaults]:
+        names = {id(plc): p.name for p, plc in zip(self._cell.positioners, self.plcs, strict=True)}
+        return {unit: self.faults[names[id(plc)]] for unit, plc in units.items()}
 
     def _hear(self, name: str, sent: bool, data: bytes) -> None:
         if self.tap is not None:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 from sim.input_world import InputWorld
 from sim.plc.modbus_tcp import ILLEGAL_ADDRESS, ModbusRefusal, ModbusTcpConnection
+from sim.plc.reply_faults import ReplyFaults
 
 CONTACTS = 16
 ANALOGUE = 4
@@ -64,12 +65,16 @@ class IoServer:
         self._connections: set[ModbusTcpConnection] = set()
         self._server: asyncio.AbstractServer | None = None
         self.tap: Callable[[str, bool, bytes], None] | None = None
+        self.faults = ReplyFaults()
 
     async def serve(self, host: str, port: int) -> tuple[str, int]:
         """Listen; return the address. Port 0 asks for a free one."""
-        units = {self._unit: self.registers}
-        loop = asyncio.get_running_loop()
-        server = await loop.create_server(lambda: ModbusTcpConnection(units, self._connections, self._hear), host, port)
+        units, faults = {self._unit: self.registers}, {self._unit: self.faults}
+
+        def connection() -> ModbusTcpConnection:
+            return ModbusTcpConnection(units, self._connections, self._hear, faults)
+
+        server = await asyncio.get_running_loop().create_server(connection, host, port)
         self._server = server
         if not server.sockets:
             return host, port

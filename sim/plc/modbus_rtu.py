@@ -11,6 +11,7 @@ import asyncio
 from collections.abc import Callable, Mapping
 
 from sim.plc.modbus_tcp import ContactDevice, RegisterDevice, answer
+from sim.plc.reply_faults import Answer, ReplyFaults
 from sim.wires.pacing import BITS_PER_BYTE, DeviceEnd
 
 LARGEST = 256
@@ -46,8 +47,10 @@ class ModbusRtuLine:
         baud: int,
         loop: asyncio.AbstractEventLoop,
         turnaround_s: float = 0.001,
+        faults: Mapping[int, ReplyFaults] | None = None,
     ) -> None:
         self._units, self._end, self._loop = units, end, loop
+        self._faults: Mapping[int, ReplyFaults] = faults or {}
         self._gap_s, self.turnaround_s = gap_s(baud), turnaround_s
         self.mangle: Callable[[bytes], bytes] = lambda frame: frame
         self.damaged = 0
@@ -69,8 +72,24 @@ class ModbusRtuLine:
         device = self._units.get(frame[0])
         if device is None or (isinstance(device, ContactDevice) and not device.answers):
             return
-        reply = frame[:1] + answer(self._units, frame[0], frame[1], frame[2:-2])
-        self._loop.call_later(self.turnaround_s, self._end.write, self.mangle(reply + crc16(reply)))
+        unit, function, body = frame[0], frame[1], frame[2:-2]
+        faults = self._faults.get(unit)
+        if faults is None:
+            self._answer(Answer(0, unit, answer(self._units, unit, function, body)))
+            return
+        for one in faults.answers(0, unit, function, lambda: answer(self._units, unit, function, body)):
+            self._answer(one)
+
+    def _answer(self, one: Answer) -> None:
+        reply = bytes((one.unit,)) + one.pdu
+        frame = bytearray(reply + crc16(reply))
+        frame[-3] ^= one.flipped
+        whole = self.mangle(bytes(frame[: len(frame) // 2] if one.cut else frame))
+        head = len(whole) // 2 if one.apart_s else len(whole)
+        after_s = self.turnaround_s + one.late_s
+        self._loop.call_later(after_s, self._end.write, whole[:head])
+        if one.apart_s:
+            self._loop.call_later(after_s + one.apart_s, self._end.write, whole[head:])
 
     def close(self) -> None:
         """Hear nothing more."""

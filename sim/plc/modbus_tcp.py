@@ -12,6 +12,8 @@ import struct
 from collections.abc import Callable, Mapping
 from typing import Protocol, cast, runtime_checkable
 
+from sim.plc.reply_faults import Answer, ReplyFaults
+
 _HEADER = struct.Struct(">HHHBB")
 _SPAN = struct.Struct(">HH")
 _WRITE = struct.Struct(">HHB")
@@ -127,15 +129,20 @@ class Forgetful(Protocol):
 
 
 class ModbusTcpConnection(asyncio.Protocol):
-    """One client connection to a host that holds `units` (unit id -> registers); `tap(by client, bytes)` hears it."""
+    """One client connection to a host that holds `units` (unit id -> registers); `tap(by client, bytes)` hears it.
+
+    `faults` are those of units that may have some.
+    """
 
     def __init__(
         self,
         units: Mapping[int, RegisterDevice],
         connections: set[ModbusTcpConnection],
         tap: Callable[[bool, bytes], None] = lambda sent, data: None,
+        faults: Mapping[int, ReplyFaults] | None = None,
     ) -> None:
         self._units, self._connections, self._tap = units, connections, tap
+        self._faults: Mapping[int, ReplyFaults] = faults or {}
         self._buffer = b""
         self._transport: asyncio.Transport
 
@@ -170,10 +177,36 @@ class ModbusTcpConnection(asyncio.Protocol):
                 break
             device = self._units.get(unit)
             if getattr(device, "answers", True):
-                reply = answer(self._units, unit, function, buffer[at + 8 : end])
-                replies.append(struct.pack(">HHHB", transaction, 0, len(reply) + 1, unit) + reply)
+                replies += self._replies(transaction, unit, function, buffer[at + 8 : end])
             at = end
         self._buffer = buffer[at:]
         if replies:
-            self._tap(False, b"".join(replies))
-            self._transport.write(b"".join(replies))
+            self._send(b"".join(replies))
+
+    def _replies(self, transaction: int, unit: int, function: int, body: bytes) -> list[bytes]:
+        """What goes back at once; what a fault delays goes later."""
+        faults = self._faults.get(unit)
+        if faults is None:
+            return [_framed(Answer(transaction, unit, answer(self._units, unit, function, body)))]
+        frames = []
+        loop = asyncio.get_running_loop()
+        for one in faults.answers(transaction, unit, function, lambda: answer(self._units, unit, function, body)):
+            frame = _framed(one)
+            head = len(frame) // 2 if one.apart_s else len(frame)
+            if one.late_s:
+                loop.call_later(one.late_s, self._send, frame[:head])
+            else:
+                frames.append(frame[:head])
+            if one.apart_s:
+                loop.call_later(one.late_s + one.apart_s, self._send, frame[head:])
+        return frames
+
+    def _send(self, data: bytes) -> None:
+        if not self._transport.is_closing():
+            self._tap(False, data)
+            self._transport.write(data)
+
+
+def _framed(one: Answer) -> bytes:
+    frame = struct.pack(">HHHB", one.transaction, 0, len(one.pdu) + 1, one.unit) + one.pdu
+    return frame[: len(frame) // 2] if one.cut else frame
