@@ -30,7 +30,7 @@ from docking.independent_points import IndependentPoints
 from docking.kinematics import ball_reactions_n, figure_residual_mm, pose_from_axes, sink_mm
 from docking.motion.settle import settle
 from docking.motion.weighing import weigh
-from docking.planning import Action, PlanRequest, check_correction, make_plan, retreat_plan
+from docking.planning import Action, Gone, PlanRequest, WayBack, check_correction, make_plan, retreat_plans
 from docking.ports import Journal, Motion, Operator
 from docking.pose import fit_pose, screen
 from docking.procedure_settings import ProcedureSettings
@@ -251,11 +251,9 @@ class Procedure(Activity[Progress]):
     async def _plan_retreat(self) -> Event:
         """The last move reversed. It rests on what was executed, not on a fit."""
         p = self.progress
-        executed = [(step.plan, step.path_time_s) for step in p.way]
-        q_now_mm, settings = self._where_axes_are(), self._settings
-        p.plan = await self._survey.aside(
-            lambda: retreat_plan(executed, q_now_mm, settings.positioners, settings.plan, p.moves + 1)
-        )
+        way = [Gone(step.plan, step.path_time_s) for step in p.way]
+        asked, settings = WayBack(1, self._where_axes_are(), p.moves + 1), self._settings
+        (p.plan,) = await self._survey.aside(lambda: retreat_plans(way, asked, settings.positioners, settings.plan))
         self.journal.write("plan", records.plan_record(p.plan))
         return Event.PLANNED
 

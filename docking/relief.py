@@ -6,7 +6,6 @@ The only relative move of single axes under load. A supervisor asks for every st
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,6 +16,7 @@ from docking import records
 from docking.activity import Activity
 from docking.errors import ForceRose, ForeignForce, NotRelieved, PlanStale
 from docking.kinematics import Positioners
+from docking.motion.force_guard import ForceGuard
 from docking.motion.settle import SettleSettings
 from docking.motion.weighing import weigh
 from docking.planning import PlanSettings
@@ -24,10 +24,7 @@ from docking.planning.relief import ReliefSettings, Scales, StepRequest, Strain,
 from docking.ports import Journal, Motion, Operator
 from docking.progress import Standing
 from docking.state import Effect, Event
-from docking.types import Array, MoveResult, Plan
-
-GUARD_READINGS, GUARD_PAUSE_S = 2, 0.02
-"""Readings that the guard of a running step averages, as often as load cells report."""
+from docking.types import Plan
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,18 +119,11 @@ class Relief(Activity[ReliefProgress]):
 
     def _check_rise(self, scales: Scales, before: Strain, now: Strain) -> None:
         """No ball may carry more than 5 % more than before the step; nor may the strain itself grow."""
-        self._refuse_rise(now.force_n - before.force_n, scales.rise_limit_n(before))
+        ForceGuard(self.run.positioners, before.force_n, scales.rise_limit_n(before)).check(now.force_n)
         slack = max(self.run.relief.rise * before.largest_n, float(scales.floor_n().max()))
         grown = now.largest_n - before.largest_n
         if not (grown <= slack):
             raise ForceRose("internal force", value=grown, limit=slack)
-
-    def _refuse_rise(self, rise_n: Array, limit_n: Array) -> None:
-        over = ~(rise_n <= limit_n)
-        if over.any():
-            i = int(np.argmax(over))
-            name = self.run.positioners.names[i]
-            raise ForceRose(f"ball {name}", value=float(rise_n[i]), limit=float(limit_n[i]))
 
     def _relieved(self, strain: Strain) -> bool:
         """Whether the relief is at its end; raises NotRelieved when it goes no further and the target is not met."""
@@ -172,42 +162,17 @@ class Relief(Activity[ReliefProgress]):
             raise PlanStale("relief", "no step is planned")
         self.journal.write("intent", records.intent_record(p.plan), durable=True)
         await self.motion.load(replace(p.plan, requires=self.run.permissives))
-        result = await self._guarded(p.plan, p.strain)
+        result, cause = await self._guard(p.plan, p.strain).run(self.motion, p.plan.plan_hash)
         p.steps, p.commanded_mm, p.result = p.steps + 1, result.commanded_mm, result
         self.journal.write("moved", records.moved_record(p.plan, result))
-        if result.cause is not None:
-            raise result.cause
+        if cause is not None:
+            raise cause
         return Event.MOVED if result.result == "done" else Event.STOPPED
 
-    async def _guarded(self, plan: Plan, before: Strain) -> MoveResult:
-        """Run the step; it is stopped on its way, and the rise raised, as soon as a ball's force rises too far."""
+    def _guard(self, plan: Plan, before: Strain) -> ForceGuard:
         run = self.run
-        limit_n = Scales(run.positioners, run.plan, run.relief, plan.q_mm[0]).rise_limit_n(before)
-        guard = asyncio.ensure_future(self._guard(before, limit_n))
-        try:
-            result = await self.motion.start(plan.plan_hash)
-        finally:
-            guard.cancel()
-        (outcome,) = await asyncio.gather(guard, return_exceptions=True)
-        if isinstance(outcome, ForceRose):
-            self.journal.write("moved", records.moved_record(plan, result))
-            raise outcome
-        return result
-
-    async def _guard(self, before: Strain, limit_n: Array) -> None:
-        latest: list[Array] = []
-        to_balls = np.transpose(self.run.positioners.axes_inverse, (0, 2, 1))
-        while True:
-            await asyncio.sleep(GUARD_PAUSE_S)
-            latest = [*latest[1 - GUARD_READINGS :], self.motion.feedback().force_n]
-            if len(latest) < GUARD_READINGS:
-                continue
-            forces = np.einsum("kij,kj->ki", to_balls, np.mean(latest, axis=0).reshape(-1, 3))
-            try:
-                self._refuse_rise(np.linalg.norm(forces, axis=1) - before.force_n, limit_n)
-            except ForceRose:
-                self.motion.request("stop")
-                raise
+        scales = Scales(run.positioners, run.plan, run.relief, plan.q_mm[0])
+        return ForceGuard(run.positioners, before.force_n, scales.rise_limit_n(before))
 
 
 def summary_of(relief: Relief) -> dict[str, Any]:

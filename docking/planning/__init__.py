@@ -15,13 +15,14 @@ from docking.planning.correction import (
 from docking.planning.mate import Scene, moved_pose, outline_edges
 from docking.planning.plan import PlanRequest, make_plan
 from docking.planning.playback import position_at
-from docking.planning.retreat import retreat_plan
+from docking.planning.retreat import Gone, WayBack, retreat_plans
 from docking.planning.settings import JamSettings, MateSettings, PlanSettings
 
 __all__ = [
     "Action",
     "Attempt",
     "ConvergenceSettings",
+    "Gone",
     "GuardSettings",
     "JamSettings",
     "MateSettings",
@@ -29,6 +30,7 @@ __all__ = [
     "PlanSettings",
     "Scene",
     "Verdict",
+    "WayBack",
     "attempt",
     "check_correction",
     "correction_to",
@@ -38,5 +40,5 @@ __all__ = [
     "moved_pose",
     "outline_edges",
     "position_at",
-    "retreat_plan",
+    "retreat_plans",
 ]

@@ -22,6 +22,7 @@ from docking.types import Array, Correction, Pose
 
 SAMPLE_MM = 0.5
 _LEAST_SAMPLES = 33
+_OFF_SAMPLES = 257
 _ROUNDING_MM = 1e-6
 
 
@@ -66,7 +67,7 @@ def check_mate(
     face = carried_points(correction, scene.X_WC.apply(mate.face_C_mm))
     samples = _samples(face, correction, scene, law, mate, quick_stop_s, axis_W)
     _check_order(samples, scene, mate)
-    points_C = mate.edges_C_mm if len(mate.edges_C_mm) else mate.face_C_mm[None, None, :]
+    points_C = _outline_C(mate)
     edges = carried_points(correction, scene.X_WC.apply(points_C))
     _check_corridor(edges, points_C, samples, scene, mate, axis_W)
     if not (len(mate.edges_C_mm) and len(mate.boxes_M_mm)):
@@ -111,8 +112,7 @@ def _check_corridor(
     inside = np.flatnonzero(samples.gap_mm <= mate.corridor_length_mm)
     if len(inside) == 0:
         return
-    straight = scene.X_WG.apply(points_C) - samples.gap_mm[inside, None, None, None] * axis_W
-    away = np.linalg.norm(edges.at(samples.s[inside]) - straight, axis=-1).max(axis=(1, 2))
+    away = _away_mm(edges.at(samples.s[inside]), points_C, samples.gap_mm[inside], scene, axis_W)
     closing = float(samples.gap_mm[0] - samples.gap_mm.min())
     leaves = bool(inside[-1] < len(samples.gap_mm) - 1)
     back = _only_back(away - mate.corridor_mm, leaves=leaves) and closing <= mate.contact_mm
@@ -125,6 +125,38 @@ def _check_corridor(
         f"{mate.corridor_length_mm:g} mm before it, {mate.corridor_mm:g} mm fit."
     )
     raise ApproachRefused("corridor", cause, value=float(away[i]), limit=mate.corridor_mm)
+
+
+def _away_mm(places: Array, points_C: Array, gap_mm: Array, scene: Scene, axis_W: Array) -> Array:
+    """How far the worst of the points at `places` (p, e, 2, 3) is from the straight insertion at each gap (p,)."""
+    straight = scene.X_WG.apply(points_C) - gap_mm[:, None, None, None] * axis_W
+    worst: Array = np.linalg.norm(places - straight, axis=-1).max(axis=(1, 2))
+    return worst
+
+
+def gap_mm(scene: Scene, mate: MateSettings) -> float:
+    """How far the docking face stands before its docked place along the insertion axis, at the start of the move."""
+    away = scene.X_WG.apply(mate.face_C_mm) - scene.X_WC.apply(mate.face_C_mm)
+    return float(away @ (scene.X_WM.R @ mate.axis_M))
+
+
+def off_straight_mm(scene: Scene, correction: Correction, mate: MateSettings) -> float:
+    """Farthest that the move takes a point of the outline off the straight insertion, inside the corridor's length."""
+    axis_W = scene.X_WM.R @ mate.axis_M
+    points_C = _outline_C(mate)
+    s = np.linspace(0.0, 1.0, _OFF_SAMPLES)
+    face = carried_points(correction, scene.X_WC.apply(mate.face_C_mm))
+    gap = (scene.X_WG.apply(mate.face_C_mm) - face.at(s)) @ axis_W
+    inside = np.flatnonzero(gap <= mate.corridor_length_mm)
+    if len(inside) == 0:
+        return 0.0
+    places = carried_points(correction, scene.X_WC.apply(points_C)).at(s[inside])
+    return float(_away_mm(places, points_C, gap[inside], scene, axis_W).max())
+
+
+def _outline_C(mate: MateSettings) -> Array:
+    """Edges (e, 2, 3) in C to look at: the docking face's centre where no outline is given."""
+    return mate.edges_C_mm if len(mate.edges_C_mm) else np.broadcast_to(mate.face_C_mm, (1, 2, 3))
 
 
 def _only_back(over_mm: Array, *, leaves: bool) -> bool:

@@ -40,6 +40,15 @@ class LoadCellErrors:
     drift_per_h: float = 0.001
     resolution_n: float = 10.0
 
+    def sigma_n(self, weighing: Weighing, hours: float = 1.0) -> Array:
+        """What each reading (m,) may be wrong by after `hours` of drift, 1 sigma."""
+        squares = (weighing.force_n**2).reshape(-1, 3)
+        crossed = self.crosstalk * np.sqrt(squares.sum(axis=1, keepdims=True) - squares).reshape(-1)
+        drift = self.drift_per_h * hours * self.range_n
+        variance = crossed**2 + drift**2 + weighing.noise_n**2 + self.resolution_n**2 / 12.0
+        result: Array = np.sqrt(variance)
+        return result
+
 
 @dataclass(frozen=True, eq=False)
 class ReliefSettings:
@@ -135,7 +144,7 @@ class Scales:
         if not np.all(np.isfinite(weighing.force_n)):
             axis = self._positioners.axes[int(np.argmax(~np.isfinite(weighing.force_n)))]
             raise LoadCellSilent(axis, "The internal force is not known without it.")
-        sigma = self._sigma(weighing, self._relief.powered_h)
+        sigma = self._relief.cells.sigma_n(weighing, self._relief.powered_h)
         bias = np.zeros_like(sigma)
         rest = sigma
         if tare is not None:
@@ -182,25 +191,15 @@ class Scales:
         result: Array = whole * min(1.0, self._relief.step_mm / largest, float(np.min(room / rise)))
         return result
 
-    def _sigma(self, weighing: Weighing, hours: float) -> Array:
-        """What each reading (m,) may be wrong by, 1 sigma."""
-        cells = self._relief.cells
-        squares = (weighing.force_n**2).reshape(-1, 3)
-        crossed = cells.crosstalk * np.sqrt(squares.sum(axis=1, keepdims=True) - squares).reshape(-1)
-        drift = cells.drift_per_h * hours * cells.range_n
-        variance = crossed**2 + drift**2 + weighing.noise_n**2 + cells.resolution_n**2 / 12.0
-        result: Array = np.sqrt(variance)
-        return result
-
     def _own_error(self, tare: Tare, now: Weighing) -> tuple[Array, Array]:
         """What the load cells add by themselves (m,), and what is left uncertain of the readings `now` (m,)."""
-        sigma = self._sigma(tare.weighing, self._relief.powered_h)
+        sigma = self._relief.cells.sigma_n(tare.weighing, self._relief.powered_h)
         seated = np.maximum(self._relief.seated_mm * self._stiffness, 1e-9)
         trust = sigma**2 / (sigma**2 + seated**2)
         bias = trust * (self._projector @ (tare.weighing.force_n - self._positioners.held_n))
         moved = Weighing(now.position_mm, now.force_n - tare.weighing.force_n, now.noise_n)
-        left = np.sqrt(trust * seated**2 + self._sigma(moved, tare.age_h) ** 2)
-        return bias, np.minimum(left, self._sigma(now, self._relief.powered_h))
+        left = np.sqrt(trust * seated**2 + self._relief.cells.sigma_n(moved, tare.age_h) ** 2)
+        return bias, np.minimum(left, self._relief.cells.sigma_n(now, self._relief.powered_h))
 
     def _told_apart(self, internal_n: Array, sigma_n: Array) -> tuple[Array, float]:
         """The modes of internal force that are larger than their uncertainty explains (m,), and the spread that is
@@ -221,13 +220,13 @@ class Scales:
         """
         expected = self._expected_n(now.position_mm)
         if tare is None:
-            change, sigma = now.force_n - expected, self._sigma(now, self._relief.powered_h)
+            change, sigma = now.force_n - expected, self._relief.cells.sigma_n(now, self._relief.powered_h)
             tolerance = self._load_tolerance_n()
         else:
             before = tare.weighing
             change = now.force_n - before.force_n - expected + self._expected_n(before.position_mm)
             moved = Weighing(now.position_mm, now.force_n - before.force_n, now.noise_n)
-            sigma = np.hypot(self._sigma(moved, tare.age_h), before.noise_n)
+            sigma = np.hypot(self._relief.cells.sigma_n(moved, tare.age_h), before.noise_n)
             share = self._load.mass_kg * float(np.linalg.norm(self._load.gravity_m_s2)) / len(self._balls)
             tolerance = np.full(len(self._balls), self._relief.foreign_share * share)
         spread = (self._rigid * sigma).reshape(-1, 3, len(sigma))

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from docking.errors import PlanStale, StrokeExceeded
 from docking.kinematics import Positioners
-from docking.planning import PlanRequest, make_plan, position_at, retreat_plan
+from docking.planning import Gone, PlanRequest, WayBack, make_plan, position_at, retreat_plans
 from docking.planning.path import rigid_path
 from docking.types import Array, Correction, Plan
 from tests.reference_geometry import GUARDED, crooked_axes, rc1, rc3
@@ -30,6 +30,12 @@ def executed(seed: int, queued: bool = False) -> Plan:
         seed, "align", "align", rng.uniform(-5, 5, 12), correction, 3.0, 0.1 if queued else 0.01, queued
     )
     return make_plan(asked, wide(seed), GUARDED)
+
+
+def back_along(way: list[tuple[Plan, float]], stood: Array, positioners: Positioners, plan_id: int) -> Plan:
+    """The last move of `way` gone back."""
+    (back,) = retreat_plans([Gone(*step) for step in way], WayBack(1, stood, plan_id), positioners, GUARDED)
+    return back
 
 
 def off_the_path(plan: Plan, seed: int, rows: Array) -> float:
@@ -52,7 +58,7 @@ def test_it_ends_where_the_move_began_and_never_leaves_its_path(seed: int, share
     plan, positioners = executed(seed, queued), wide(seed)
     reached_s = share * plan.duration_s
     stood = position_at(plan, reached_s)
-    back = retreat_plan([(plan, reached_s)], stood, positioners, GUARDED, 7)
+    back = back_along([(plan, reached_s)], stood, positioners, 7)
     np.testing.assert_allclose(back.q_mm[-1], plan.q_mm[0], atol=1e-9, rtol=0.0)
     np.testing.assert_allclose(back.q_mm[0], stood, atol=2e-3 if queued else 1e-5, rtol=0.0)
     assert off_the_path(plan, seed, back.q_mm[:: max(1, len(back.q_mm) // 40)]) <= 1e-9
@@ -77,7 +83,7 @@ def test_it_is_not_faster_than_it_came() -> None:
         False,
     )
     plan = make_plan(asked, rc1(), GUARDED)
-    back = retreat_plan([(plan, plan.duration_s)], plan.q_mm[-1], rc1(), GUARDED, 2)
+    back = back_along([(plan, plan.duration_s)], plan.q_mm[-1], rc1(), 2)
     assert np.abs(np.diff(back.q_mm, axis=0)).max() / 0.01 <= 0.2 * (1 + 1e-6)
     assert back.duration_s == pytest.approx(plan.duration_s, rel=0.01)
     np.testing.assert_allclose(back.displacement_mm, -plan.displacement_mm, atol=1e-9)
@@ -90,7 +96,7 @@ def test_passive_axes_begin_where_they_are() -> None:
     )  # fmt: skip
     plan = make_plan(asked, rc3(), GUARDED)
     slipped = np.where(rc3().driven, 0.0, 0.01)
-    back = retreat_plan([(plan, plan.duration_s)], plan.q_mm[-1] + slipped, rc3(), GUARDED, 2)
+    back = back_along([(plan, plan.duration_s)], plan.q_mm[-1] + slipped, rc3(), 2)
     np.testing.assert_allclose(back.q_mm[0], plan.q_mm[-1] + slipped, atol=1e-9)
     np.testing.assert_allclose(back.q_mm[-1], plan.q_mm[0] + slipped, atol=1e-9)
 
@@ -108,7 +114,7 @@ def test_what_cannot_be_gone_back_is_refused() -> None:
         ([(replace(plan, kind="relief"), plan.duration_s)], end),
     ):
         with pytest.raises(PlanStale):
-            retreat_plan(way, stood, positioners, GUARDED, 2)
+            back_along(way, stood, positioners, 2)
     short = replace(positioners, stroke_mm=np.tile([-3.0, 3.0], (12, 1)))
     with pytest.raises(StrokeExceeded):
-        retreat_plan([(plan, plan.duration_s)], end, short, GUARDED, 2)
+        back_along([(plan, plan.duration_s)], end, short, 2)
