@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from docking.errors import BadArgument, NotLocalised
+from docking.geometry import exp_so3
 from docking.guidance import guided
 from docking.guidance.features import Features, extract
 from docking.guidance.opencv import opencv
@@ -28,6 +29,8 @@ Rows = NDArray[np.intp]
 _MOST_SEARCHES = 5
 _GROWTH = 1.03
 """A search that finds this many times the points of the one before is followed by another."""
+_ALIKE, _APART = 1.25, 0.02
+"""A second pose fits too when its rms is at most so many times the first one's; so many depths away it is another."""
 COVERAGE = 2.0
 """Predicted errors are this many sigmas."""
 
@@ -46,7 +49,7 @@ class LocaliseSettings:
     least_features: int = 200
     radius_px: float = 8.0
     ransac_px: float = 4.0
-    most_rms_px: float = 4.0
+    most_rms_px: float = 3.5
     map_sigma_mm: float = 1.0
     limit_mm: float = 10.0
 
@@ -212,6 +215,8 @@ class Localiser:
             raise self._refused(f"points agree only within {fit.rms_px:.1f} px", count, s.least_points)
         p_C = fit.X_WC.inverse().apply(self.ar_map.points_mm[points[inside]])
         depth = float(np.median(p_C[:, 2]))
+        if _second_pose(self.camera, fit, guided.sights(self.ar_map, features, rows, points)):
+            raise self._refused("two poses fit what is seen, turned about the part in view", count, s.least_points)
         generation = float(np.mean(self.index.generation[points[inside]]))
         sigma = max(s.map_sigma_mm, self.ar_map.quality.marker_rms_mm or 0.0) * float(np.sqrt(1.0 + generation))
         return Localised(
@@ -221,3 +226,28 @@ class Localiser:
 
     def _refused(self, cause: str, count: int, needed: int) -> NotLocalised:
         return NotLocalised("image", cause, value=count, limit=needed)
+
+
+def _second_pose(camera: Camera, fit: CameraFit, sights: Sights) -> bool:
+    """Whether the points fit nearly as well from the pose mirrored at the line of sight.
+
+    A flat patch that fills little of the image looks nearly the same with its normal n and with n mirrored at the line
+    of sight s: the camera turned about the patch's middle by the rotation that takes n to 2 (n.s) s - n.
+    """
+    patch = sights.where(fit.inside)
+    p_C = fit.X_WC.inverse().apply(patch.points_mm)
+    middle = p_C.mean(axis=0)
+    normal = np.linalg.svd(p_C - middle, full_matrices=False)[2][2]
+    toward = middle / np.linalg.norm(middle)
+    mirrored = 2.0 * float(normal @ toward) * toward - normal
+    turn = np.cross(normal, mirrored)
+    angle = float(np.arctan2(np.linalg.norm(turn), normal @ mirrored))
+    R = exp_so3(turn / max(float(np.linalg.norm(turn)), 1e-12) * angle)
+    start = fit.X_WC @ Pose(R, middle - R @ middle).inverse()
+    try:
+        other = refine(camera, start, patch)
+    except NotLocalised:
+        return False
+    apart = float(np.linalg.norm(other.X_WC.t_mm - fit.X_WC.t_mm))
+    alike = other.rms_px <= _ALIKE * fit.rms_px and np.count_nonzero(other.inside) >= len(patch) / _ALIKE
+    return bool(alike and apart > _APART * float(np.linalg.norm(middle)))
