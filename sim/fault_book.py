@@ -15,6 +15,7 @@ from types import UnionType
 from typing import Any, get_args
 
 from docking.config import CellFile
+from docking.config.cell import CanBus
 from sim.canopen.group import DriveGroup
 from sim.canopen.io_module import IoModule
 from sim.input_world import InputWorld
@@ -105,8 +106,8 @@ class FaultBook:
 
     # drives ------------------------------------------------------------------------------------------------------
     def _drives(self, cell: CellFile, group: DriveGroup) -> None:
-        faults = group.faults
-        for axis in cell.axis_names:
+        faults, bus = group.faults, _bus_name(cell, group)
+        for axis in group.axes:
             for name in LOST_FRAMES:
                 method = getattr(faults, name)
                 self._add(axis, name, Fault(partial(method, axis), partial(method, axis, 0)))
@@ -120,9 +121,9 @@ class FaultBook:
             self._add(axis, "trip", Fault(partial(group.trip, axis)))
             self._add(axis, "restart", Fault(partial(group.restart, axis)))
         wire = faults.wire
-        self._add("bus", "lose_sync", Fault(faults.lose_sync, partial(faults.lose_sync, 0)))
-        self._add("bus", "silent", Fault(partial(wire.silence, True), partial(wire.silence, False)))
-        self._add("bus", "delay", Fault(partial(_late, wire.delay), partial(wire.delay, None)))
+        self._add(bus, "lose_sync", Fault(faults.lose_sync, partial(faults.lose_sync, 0)))
+        self._add(bus, "silent", Fault(partial(wire.silence, True), partial(wire.silence, False)))
+        self._add(bus, "delay", Fault(partial(_late, wire.delay), partial(wire.delay, None)))
 
     def _plcs(self, cell: CellFile, group: PlcGroup) -> None:
         for station in cell.positioners:
@@ -176,6 +177,15 @@ def _healed(begin: Callable[..., None], **healthy: Any) -> Fault:
 
 def _plain(act: Callable[[], None]) -> None:
     act()
+
+
+def _bus_name(cell: CellFile, group: DriveGroup) -> str:
+    """`bus`; with several of them `bus:CHANNEL`."""
+    station = next(p for p in cell.positioners if f"{p.name}.{p.axes[0].name}" in group.axes)
+    bus = cell.bus
+    if not isinstance(bus, CanBus) or not bus.further_channels:
+        return "bus"
+    return f"bus:{station.can_channel or bus.channel}"
 
 
 def _on(limit_switch: Callable[..., None], axis: str, stops: bool = False) -> None:

@@ -10,11 +10,11 @@ from pathlib import Path
 
 from docking.assemble.requests import WireChoice, opened, read_wires
 from docking.assemble.simulated import make_far_end, real_wires, truth_of
-from docking.assemble.wires import Addresses, near_bus
+from docking.assemble.wires import Addresses, near_bus, transcribed_can
 from docking.config import CellFile
 from docking.config.load import default_job_path, load_cell, load_job
 from docking.ports import CanLink, SerialLink
-from docking.transcript import TranscribedCan, TranscribedSerial, Transcript
+from docking.transcript import TranscribedSerial, Transcript
 from drivers.links.serial_port import SerialPort
 
 
@@ -67,7 +67,7 @@ async def wires_of(request: LookRequest, cell: CellFile) -> AsyncIterator[Ends]:
         if transcript is not None:
             stack.callback(transcript.close)
             serial = TranscribedSerial(serial, transcript, "tracker")
-            can = TranscribedCan(can, transcript) if can is not None else None
+            can = transcribed_can(can, transcript) if can is not None else None
         yield Ends(port, serial, can, modbus, transcript)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 
-from docking.assemble.wires import Addresses, transcribed_line
+from docking.assemble.wires import Addresses, transcribed_can, transcribed_line
 from docking.config import CellFile, JobFile
 from docking.config.cell import ModbusBus
 from docking.config.inputs import InputsConfig, ModbusModule
@@ -16,7 +16,7 @@ from docking.motion.monitors import watch_from
 from docking.motion.remote import LeaseSettings, RemoteMotion
 from docking.motion.served import LocalMotion, ServedMotion, ServiceSettings
 from docking.ports import CanLink
-from docking.transcript import TranscribedCan, Transcript
+from docking.transcript import Transcript
 from drivers.canopen.io_module import CanIoModule
 from drivers.canopen.positioners import CanopenPositioners
 from drivers.canopen.shared import SharedCan
@@ -33,7 +33,7 @@ def local_motion(
     """What drives the axes and reads the inputs, in the process that calls; `transcript` gets all bytes."""
     inputs = cell.inputs
     if transcript is not None and can is not None:
-        can = TranscribedCan(can, transcript)
+        can = transcribed_can(can, transcript)
     if inputs is None:
         return _axes(cell, job, can, modbus, transcript)
     shared = SharedCan(can) if can is not None else None

@@ -112,11 +112,25 @@ def _refuse_real_devices(path: Path, found: dict[str, Any]) -> None:
     listed = found.get("modbus")
     hosts = [str(at[0]) for at in listed.values() if at] if isinstance(listed, dict) else []
     far = [host for host in hosts if host not in LOOPBACK]
-    tracker, can = str(found.get("tracker", "")), str(found.get("can", ""))
+    tracker = str(found.get("tracker", ""))
     far += [tracker] if tracker and not tracker.startswith("/dev/pts/") else []
-    far += [can] if can and not Path(can).is_socket() else []
+    far += [path for path in _bus_paths(found) if path and not Path(path).is_socket()]
     if far:
         raise BadArgument("--wires", f"{far[0]} is no simulated device of this machine", value=str(path))
+
+
+def _has_buses(cell: CellFile, found: dict[str, Any]) -> bool:
+    """A socket for the one CAN bus of the cell, or one for each of several."""
+    can, channels = found.get("can"), getattr(cell.bus, "channels", ())
+    if len(channels) > 1:
+        return isinstance(can, dict) and set(can) == set(channels)
+    return isinstance(can, str)
+
+
+def _bus_paths(found: dict[str, Any]) -> list[str]:
+    """The sockets of the CAN buses."""
+    can = found.get("can", "")
+    return [str(path) for path in can.values()] if isinstance(can, dict) else [str(can)]
 
 
 def opened(path: Path | None) -> Transcript | None:
@@ -144,7 +158,7 @@ def read_wires(path: Path, cell: CellFile) -> dict[str, Any]:
     queued = cell.bus.kind == "modbus-tcp"
     expected |= {p.name for p in cell.positioners} if queued else set()
     listed = found.get("modbus", {})
-    whole = isinstance(listed, dict) and set(listed) == expected and (queued or isinstance(found.get("can"), str))
+    whole = isinstance(listed, dict) and set(listed) == expected and (queued or _has_buses(cell, found))
     _refuse_real_devices(path, found)
     if not (whole and isinstance(found.get("tracker"), str)):
         cause = "the file lacks addresses of this cell; let `docking sim` write it"

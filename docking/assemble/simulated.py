@@ -11,7 +11,9 @@ import numpy as np
 
 from docking.assemble.controller import Wires
 from docking.assemble.transcribed import TranscribedDevice, TranscribedStation
+from docking.assemble.wires import can_of
 from docking.config import CellFile, JobFile
+from docking.config.build import plan_period_s
 from docking.config.cell import CanBus, ModbusBus
 from docking.config.inputs import CanModule, ModbusModule
 from docking.errors import BadArgument
@@ -19,6 +21,7 @@ from docking.transcript import Transcript
 from sim.canopen.group import DriveGroup
 from sim.canopen.io_module import IoModule
 from sim.canopen.settings import DriveSettings
+from sim.canopen.shares import PlantShare, PlantShares
 from sim.input_world import InputWorld
 from sim.instrument import Instrument
 from sim.plant import Plant
@@ -33,7 +36,7 @@ from sim.wires.pacing import DeviceEnd
 from sim.wires.pty_serial import PtySerial
 from sim.wires.shared_end import SharedEnd
 from sim.wires.unix_can import UnixCanServer
-from sim.wires.virtual_can import VirtualCan
+from sim.wires.virtual_can import VirtualCan, VirtualCanEnd
 from sim.wires.virtual_serial import VirtualSerial
 
 LOCAL = "127.0.0.1"
@@ -63,14 +66,20 @@ class FarEnd:
     devices: list[Any] = field(default_factory=list)
     line: VirtualSerial | None = None
     transcript: Transcript | None = None
+    shares: PlantShares | None = None
 
     def tracker(self, cell: CellFile, wire: DeviceEnd) -> None:
         """Put the instrument on a serial wire."""
         device = {"line": LineTrackerDevice, "geocom": GeocomStation}[cell.tracker.protocol]
         self.devices.append(device(self.instrument, wire, self.loop, self.seed))
 
-    def drives(self, cell: CellFile, wire: CanEnd, *, shared_cpu: bool = False) -> None:
-        """Put the drives on a CAN bus."""
+    def drives(self, cell: CellFile, wire: CanEnd, *, shared_cpu: bool = False, channel: str | None = None) -> None:
+        """Put the drives on a CAN bus; where there are several, those of `channel`."""
+        share: PlantShare | None = None
+        if channel is not None:
+            cell = cell.on_channel(channel)
+            self.shares = self.shares or PlantShares(self.plant, plan_period_s(cell))
+            share = self.shares.share(cell.axis_names)
         drives = self.truth.drives
         settings = DriveSettings(
             sync_loss=drives.sync_loss,
@@ -81,7 +90,10 @@ class FarEnd:
         modules = [m for m in cell.inputs.modules if isinstance(m, CanModule)] if cell.inputs else []
         shared = SharedEnd(wire)
         # A bus of drives alone keeps its own end: every frame would pass one more pair of hands.
-        group = DriveGroup(self.plant, cell, settings, shared.station() if modules else wire, self.loop)
+        end = shared.station() if modules else wire
+        group = DriveGroup(share or self.plant, cell, settings, end, self.loop)
+        if share is not None:
+            share.at = group.at
         group.start()
         self.devices.append(group)
         for module in modules:
@@ -139,12 +151,23 @@ async def virtual_wires(cell: CellFile, far: FarEnd) -> Wires:
     far.line = serial = VirtualSerial(far.loop, cell.tracker.baud)
     far.tracker(cell, serial.far)
     if isinstance(cell.bus, CanBus):
-        bus = VirtualCan(far.loop, cell.bus.bitrate)
+        can = can_of(cell, await virtual_buses(cell, far))
+        return Wires(serial.near, can=can, modbus=await far.modbus_inputs(cell))
+    return Wires(serial.near, modbus=await far.plcs(cell, None))
+
+
+async def virtual_buses(cell: CellFile, far: FarEnd) -> dict[str, VirtualCanEnd]:
+    """The drives on buses inside the process; returns the near ends by channel."""
+    if not isinstance(cell.bus, CanBus):
+        return {}
+    ends = {}
+    for channel in cell.bus.channels:
+        bus = VirtualCan(far.loop, cell.bus.bitrate, channel)
         far_end = bus.end()
         await far_end.open()
-        far.drives(cell, far_end)
-        return Wires(serial.near, can=bus.end(), modbus=await far.modbus_inputs(cell))
-    return Wires(serial.near, modbus=await far.plcs(cell, None))
+        far.drives(cell, far_end, channel=channel if cell.bus.further_channels else None)
+        ends[channel] = bus.end()
+    return ends
 
 
 async def real_wires(cell: CellFile, far: FarEnd, folder: Path, transcript: Transcript | None = None) -> dict[str, Any]:
@@ -159,11 +182,17 @@ async def real_wires(cell: CellFile, far: FarEnd, folder: Path, transcript: Tran
         addresses = {p.name: (LOCAL, 0) for p in cell.positioners}
         found["modbus"] = {name: list(at) for name, at in (await far.plcs(cell, addresses)).items()}
         return found
-    bus = UnixCanServer(folder / "can.sock")
-    await bus.open()
-    far.drives(cell, TranscribedStation(bus, transcript) if transcript is not None else bus, shared_cpu=True)
-    far.devices.append(bus)
-    found["can"] = str(bus.path)
+    several = len(cell.bus.channels) > 1
+    paths = {}
+    for number, channel in enumerate(cell.bus.channels):
+        bus = UnixCanServer(folder / (f"can{number}.sock" if several else "can.sock"))
+        await bus.open()
+        name = f"can:{channel}" if several else "can"
+        end = TranscribedStation(bus, transcript, name) if transcript is not None else bus
+        far.drives(cell, end, shared_cpu=True, channel=channel if several else None)
+        far.devices.append(bus)
+        paths[channel] = str(bus.path)
+    found["can"] = paths if several else paths[cell.bus.channel]
     beside = {name: list(at) for name, at in (await far.modbus_inputs(cell, LOCAL)).items()}
     if beside:
         found["modbus"] = beside

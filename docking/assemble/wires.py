@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from docking.config import CellFile
 from docking.ports import CanLink, SerialLink
-from docking.transcript import TranscribedSerial, Transcript
+from docking.transcript import TranscribedCan, TranscribedSerial, Transcript
+from drivers.canopen.channels import ChannelledCan
+from drivers.canopen.nodes import channel_of_node
 from drivers.links.can_bus import CanBusLink
 from drivers.links.serial_port import SerialPort
 
@@ -38,6 +41,24 @@ def near_bus(cell: CellFile, found: dict[str, Any]) -> tuple[CanLink | None, Add
     addresses = {name: (str(host), int(port)) for name, (host, port) in listed.items()} if listed else None
     if cell.bus.kind != "canopen":
         return None, addresses
-    if "can" in found:
-        return CanBusLink("docking-unix", found["can"], cell.bus.bitrate), addresses
-    return CanBusLink(cell.bus.interface, cell.bus.channel, cell.bus.bitrate), addresses
+    bus, paths = cell.bus, found.get("can")
+    if isinstance(paths, str):
+        paths = {bus.channel: paths}
+    interface = bus.interface if paths is None else "docking-unix"
+    at = {channel: channel for channel in bus.channels} if paths is None else paths
+    links = {channel: CanBusLink(interface, at[channel], bus.bitrate) for channel in bus.channels}
+    return can_of(cell, links), addresses
+
+
+def can_of(cell: CellFile, links: Mapping[str, CanLink]) -> CanLink:
+    """One link for all CAN buses of a cell: the only one, or all of them behind one face. `links` by channel."""
+    if len(links) == 1:
+        return next(iter(links.values()))
+    return ChannelledCan(links, channel_of_node(cell))
+
+
+def transcribed_can(link: CanLink, transcript: Transcript) -> CanLink:
+    """The link with every frame in the transcript, each bus under its own name."""
+    if isinstance(link, ChannelledCan):
+        return link.wrapped(lambda name, one: TranscribedCan(one, transcript, f"can:{name}"))
+    return TranscribedCan(link, transcript)

@@ -107,7 +107,8 @@ def convergence_settings(cell: CellFile, job: JobFile) -> ConvergenceSettings:
 
 
 def plan_settings(cell: CellFile, job: JobFile) -> PlanSettings:
-    """Settings of the planner. Axes on a common SYNC start together; positioner PLCs run on their own clocks."""
+    """Settings of the planner. Axes on a common SYNC start together, those of several CAN buses nearly so; positioner
+    PLCs run on their own clocks."""
     limits, bus = cell.limits, cell.bus
     return PlanSettings(
         load=load_from(cell, job),
@@ -115,7 +116,7 @@ def plan_settings(cell: CellFile, job: JobFile) -> PlanSettings:
         reaction_min_fraction=limits.reaction_min_fraction,
         chord_error_mm=limits.chord_error_mm,
         sync_error_mm=limits.sync_error_mm,
-        start_skew_s=bus.start_skew_s if isinstance(bus, ModbusBus) else 0.0,
+        start_skew_s=bus.start_skew_s,
         clock_ppm=bus.clock_ppm if isinstance(bus, ModbusBus) else 0.0,
         playback_ramp_s=bus.ramp_s if isinstance(bus, ModbusBus) else 0.0,
         jam=jam_settings(cell),

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from docking.config.base import Finite, Fraction, Model, Name, NonNegative, PoseVector, Positive, Vector3
-from docking.config.inputs import InputsConfig
+from docking.config.inputs import CanModule, InputsConfig, ModbusModule
 from docking.config.instruments import GeocomConfig, InertialConfig, NdiConfig
 
 
@@ -86,6 +86,13 @@ class CanBus(Model):
     kind: Literal["canopen"] = Field(description="twelve or fewer CiA 402 drives that take one position each cycle")
     interface: str = Field(description="python-can interface name, such as socketcan")
     channel: str = Field(description="python-can channel, such as can0")
+    further_channels: tuple[str, ...] = Field(
+        default=(), description="further buses of the same kind; a positioner says by can_channel which is its own"
+    )
+    sync_skew_s: NonNegative = Field(
+        default=0.001,
+        description="with further_channels: largest time between the SYNCs of one cycle on two of the buses, s",
+    )
     bitrate: Literal[125000, 250000, 500000, 1000000] = Field(default=1000000, description="bit/s")
     cycle_s: Annotated[float, Field(ge=0.002, le=0.1)] = Field(default=0.01, description="SYNC period, s")
     heartbeat_s: Annotated[float, Field(ge=0.02, le=1.0)] = Field(
@@ -109,6 +116,16 @@ class CanBus(Model):
     servo_lag_s: Annotated[float, Field(ge=0.0, le=0.1)] = Field(
         default=0.002, description="following error of a healthy axis, divided by its speed, s"
     )
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """All buses of the cell, the first first."""
+        return (self.channel, *self.further_channels)
+
+    @property
+    def start_skew_s(self) -> float:
+        """How far apart two axes may begin one cycle: nothing on one SYNC."""
+        return self.sync_skew_s if self.further_channels else 0.0
 
 
 class ModbusBus(Model):
@@ -207,6 +224,9 @@ class PositionerConfig(Model):
     host: str | None = Field(default=None, description="Modbus TCP address")
     port: Annotated[int, Field(ge=1, le=65535)] | None = Field(default=None, description="Modbus TCP port")
     unit: Annotated[int, Field(ge=1, le=247)] | None = Field(default=None, description="Modbus unit id")
+    can_channel: str | None = Field(
+        default=None, description="the CAN bus of its axes: bus.channel or one of bus.further_channels; the first"
+    )
     load_cell: bool = Field(default=False, description="a three-component load cell sits under the ball")
 
 
@@ -381,6 +401,20 @@ class CellFile(Model):
     def driven(self) -> tuple[bool, ...]:
         """Which axes hold a position."""
         return tuple(a.driven for p in self.positioners for a in p.axes)
+
+    def on_channel(self, channel: str) -> CellFile:
+        """The cell as one of its CAN buses knows it: the positioners and I/O modules there, and nothing else."""
+        if not isinstance(self.bus, CanBus):
+            raise ValueError(f"bus.kind is {self.bus.kind!r}: there are no CAN buses")
+        first = self.bus.channel
+
+        def here(one: PositionerConfig | CanModule | ModbusModule) -> bool:
+            return getattr(one, "can_channel", None) in ((None, channel) if channel == first else (channel,))
+
+        change: dict[str, object] = {"positioners": tuple(p for p in self.positioners if here(p))}
+        if self.inputs is not None:
+            change["inputs"] = self.inputs.model_copy(update={"modules": tuple(filter(here, self.inputs.modules))})
+        return self.model_copy(update=change)
 
     @property
     def powered(self) -> tuple[bool, ...]:

@@ -35,7 +35,8 @@ def _instrument(cell: CellFile) -> str:
 
 def _bus(cell: CellFile) -> str:
     if isinstance(cell.bus, CanBus):
-        return f"CANopen {cell.bus.bitrate // 1000} kbit/s, {1.0 / cell.bus.cycle_s:g} Hz"
+        buses = f"{len(cell.bus.channels)} buses, " if cell.bus.further_channels else ""
+        return f"CANopen {buses}{cell.bus.bitrate // 1000} kbit/s, {1.0 / cell.bus.cycle_s:g} Hz"
     return f"Modbus TCP, segments of {cell.bus.segment_s:g} s"
 
 

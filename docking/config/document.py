@@ -3,6 +3,7 @@ its model still has these problems named in the same report; what is missing or 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from itertools import pairwise
 from typing import Any
@@ -104,7 +105,8 @@ def _addresses(doc: Document) -> list[Finding]:
             for key, axis in entries(doc, "positioners[].axes[]")
             if isinstance(axis, Mapping) and axis.get("node") is None
         ]
-        return missing + duplicates(entries(doc, "positioners[].axes[].node"), "node id") + _can_timing(doc)
+        twice = duplicates(entries(doc, "positioners[].axes[].node"), "node id")
+        return missing + twice + _can_channels(doc) + _can_timing(doc)
     if kind == "modbus-tcp":
         found = [(key, p) for key, p in entries(doc, "positioners[]") if isinstance(p, Mapping)]
         missing = [
@@ -126,6 +128,32 @@ def _hashable(address: tuple[Any, ...]) -> bool:
     return all(isinstance(part, str | int) for part in address)
 
 
+def _channels_of_axes(doc: Document) -> list[tuple[str, str]]:
+    """(key of its positioner, CAN channel) of every axis."""
+    first = next((value for _, value in entries(doc, "bus.channel")), None)
+    return [
+        (key, str(station.get("can_channel") or first))
+        for key, station in entries(doc, "positioners[]")
+        if isinstance(station, Mapping)
+        for _ in entries(station, "axes[]")
+    ]
+
+
+def _can_channels(doc: Document) -> list[Finding]:
+    """Every channel once, every positioner on one of them, none without a positioner."""
+    named = [*entries(doc, "bus.channel"), *entries(doc, "bus.further_channels[]")]
+    known = [value for _, value in named]
+    used = {channel for _, channel in _channels_of_axes(doc)}
+    wrong = [
+        error(key, f"{value!r} is none of the buses: {', '.join(map(str, known))}")
+        for path in ("positioners[].can_channel", "inputs.modules[].can_channel")
+        for key, value in entries(doc, path)
+        if value is not None and value not in known
+    ]
+    idle = [error(key, f"no positioner is on {value!r}") for key, value in named if value not in used]
+    return duplicates(iter(named), "CAN channel") + wrong + (idle if not wrong else [])
+
+
 def _can_timing(doc: Document) -> list[Finding]:
     """Worst-case frame bits of one cycle (SYNC, 7-byte RPDO and 8-byte TPDO an axis) against the cycle time."""
     rates, cycles = numbers(doc, "bus.bitrate"), numbers(doc, "bus.cycle_s")
@@ -134,7 +162,7 @@ def _can_timing(doc: Document) -> list[Finding]:
     if beats and guards and not guards[0][1] > beats[0][1]:
         findings.append(error(guards[0][0], f"{guards[0][1]:g} s must be over bus.heartbeat_s = {beats[0][1]:g} s"))
     if rates and cycles and rates[0][1] > 0.0 and cycles[0][1] > 0.0:
-        axes = sum(1 for _ in entries(doc, "positioners[].axes[]"))
+        axes = max(Counter(channel for _, channel in _channels_of_axes(doc)).values(), default=0)
         load = (55 + axes * (125 + 135)) / rates[0][1] / cycles[0][1]
         text = f"{cycles[0][1]:g} s: {axes} axes at {rates[0][1]:g} bit/s load the bus to {load:.0%}, "
         if not load <= 1.0:

@@ -22,6 +22,9 @@ class CanModule(Model):
     refresh_s: Annotated[float, Field(ge=0.01, le=1.0)] = Field(
         default=0.05, description="the module repeats its inputs so often, and at every change, s"
     )
+    can_channel: str | None = Field(
+        default=None, description="its CAN bus: bus.channel or one of bus.further_channels; the first when left out"
+    )
     map: str = Field(default="cia401", description="object map in drivers/maps")
 
 

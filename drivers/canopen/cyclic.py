@@ -69,7 +69,8 @@ class CyclicImage:
         self._force_index = {self._map.pdos["force"].cob + n.node: n.index for n in self.nodes if n.load_cell}
         self._raw: list[bytes] = [bytes(codec.READ_BACK.itemsize)] * count
         self._gathered: dict[int, bytes] = {}
-        self._gathered_cycle, self._gathered_cob = _NEVER, 0
+        self._gathered_cycle = _NEVER
+        self._gathered_cobs = dict.fromkeys((node.channel for node in self.nodes), 0)
         self._joined: bytes | None = None
         self._head: list[CanFrame] | None = None
         self._decoded = b""
@@ -225,16 +226,19 @@ class CyclicImage:
         """Keep a read-back until those of the same SYNC are here, or the next SYNC's begin.
 
         Positions of different instants would make a moving figure look strained. A set is as old as its first frame.
-        What the host hears of a set only after the next SYNC comes in the order of the bus, lowest identifier first: a
+        What the host hears of a set only after the next SYNC comes in the order of its bus, lowest identifier first: a
         lower one than the last begins the next set, or sets that lost frames would stay mixed for ever.
         """
         index = self._index[cob]
+        last, channel = self._gathered_cobs, self.nodes[index].channel
         syncs = self.cycles - self._gathered_cycle
-        if self._gathered and (index in self._gathered or syncs > 1 or (syncs and cob < self._gathered_cob)):
+        if self._gathered and (index in self._gathered or syncs > 1 or (syncs and cob < last[channel])):
             self._pass_on()
         if not self._gathered:
             self._gathered_cycle = self.cycles
-        self._gathered[index], self._gathered_cob = data, cob
+            for each in last:
+                last[each] = 0
+        self._gathered[index], last[channel] = data, cob
         if len(self._gathered) == len(self._cobs):
             self._pass_on()
 

@@ -5,18 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from docking.config.cell import AxisConfig, CanBus, CellFile
+from docking.config.inputs import CanModule
 from docking.errors import ConfigInvalid
 
 
 @dataclass(frozen=True)
 class AxisNode:
-    """One axis on the bus; `index` is its place in the cell's axis order."""
+    """One axis on the bus `channel`; `index` is its place in the cell's axis order."""
 
     name: str
     index: int
     node: int
     axis: AxisConfig
     load_cell: bool
+    channel: str = ""
 
     @property
     def driven(self) -> bool:
@@ -46,11 +48,20 @@ def can_bus_of(cell: CellFile) -> CanBus:
     return cell.bus
 
 
+def channel_of_node(cell: CellFile) -> dict[int, str]:
+    """The bus of every node, axes and I/O modules. Node numbers are unique in a cell, whichever bus they are on."""
+    first = can_bus_of(cell).channel
+    found = {axis.node: p.can_channel or first for p in cell.positioners for axis in p.axes if axis.node is not None}
+    modules = [m for m in cell.inputs.modules if isinstance(m, CanModule)] if cell.inputs else []
+    return {**found, **{module.node: module.can_channel or first for module in modules}}
+
+
 def axis_nodes(cell: CellFile, host_node: int) -> tuple[AxisNode, ...]:
     """All axes in cell order. Raises ConfigInvalid for missing, repeated or reserved node numbers."""
     nodes: list[AxisNode] = []
     problems: list[str] = []
     taken = {host_node: "the controller"}
+    first = can_bus_of(cell).channel
     for positioner in cell.positioners:
         for axis in positioner.axes:
             name = f"{positioner.name}.{axis.name}"
@@ -60,7 +71,8 @@ def axis_nodes(cell: CellFile, host_node: int) -> tuple[AxisNode, ...]:
             if axis.node in taken:
                 problems.append(f"axis {name}: node {axis.node} belongs to {taken[axis.node]}")
             taken[axis.node] = name
-            nodes.append(AxisNode(name, len(nodes), axis.node, axis, positioner.load_cell))
+            channel = positioner.can_channel or first
+            nodes.append(AxisNode(name, len(nodes), axis.node, axis, positioner.load_cell, channel))
     if problems:
         raise ConfigInvalid(cell.name, tuple(problems))
     return tuple(nodes)

@@ -41,6 +41,7 @@ class CanopenPositioners:
 
     def __init__(self, cell: CellFile, link: CanLink) -> None:
         self._bus, self._limits, self._link = can_bus_of(cell), cell.limits, link
+        self._wire = ", ".join(self._bus.channels)
         self._map = load_object_map(self._bus.map)
         self._nodes = axis_nodes(cell, self._map.host_node)
         self.axes: tuple[str, ...] = cell.axis_names
@@ -114,9 +115,9 @@ class CanopenPositioners:
         Raises EnableFailed naming the axis; then all axes are disabled again. Never resets a fault.
         """
         if not self._open:
-            raise EnableFailed(self._bus.channel, "the bus has not been brought up", value="bus closed")
+            raise EnableFailed(self._wire, "the bus has not been brought up", value="bus closed")
         if self._silent:
-            raise EnableFailed(self._bus.channel, "the hardware chain was opened: start again", value="silent")
+            raise EnableFailed(self._wire, "the hardware chain was opened: start again", value="silent")
         self._live, self._stopping, self._sequencing = False, False, True
         self._watch.rearm()
         try:
@@ -239,7 +240,7 @@ class CanopenPositioners:
         results = await asyncio.gather(*jobs, return_exceptions=True)
         errors = [result for result in results if isinstance(result, BaseException)]
         if self._lost is not None:
-            raise LinkLost(self._bus.channel, self._lost)
+            raise LinkLost(self._wire, self._lost)
         if errors:
             raise errors[0]
         return tuple(result for result in results if isinstance(result, Identity))
@@ -324,18 +325,18 @@ class CanopenPositioners:
         """Let one cycle pass. Raises LinkLost, or EnableFailed when a quick stop came in between."""
         await asyncio.sleep(self.cycle_s)
         if self._lost is not None:
-            raise LinkLost(self._bus.channel, self._lost)
+            raise LinkLost(self._wire, self._lost)
         if self._stopping:
             raise EnableFailed(self.axes[0], "a quick stop was commanded meanwhile", value="quick stop")
 
     def _require_link(self) -> None:
         if self._lost is not None or self._silent or not self._open:
-            raise LinkLost(self._bus.channel, self._lost or ("gone silent" if self._silent else "the bus is not open"))
+            raise LinkLost(self._wire, self._lost or ("gone silent" if self._silent else "the bus is not open"))
 
     def _send(self, frames: list[CanFrame]) -> None:
         self._link.send(frames)
         if self._lost is not None:
-            raise LinkLost(self._bus.channel, self._lost)
+            raise LinkLost(self._wire, self._lost)
 
     def _cause_of(self, index: int) -> str:
         _, code, text = self._watch.fault_of(index)
@@ -370,4 +371,15 @@ class CanopenPositioners:
 
     def _on_lost(self, reason: str) -> None:
         if self._lost is None:
+            self._stop_what_is_left()
             self._lost = reason
+
+    def _stop_what_is_left(self) -> None:
+        """One of several buses is gone: axes on the others carry the same part and must not go on without its axes."""
+        if not self._bus.further_channels:
+            return
+        enabled = [i for i in self._image.powered if self._image.state(i) is DriveState.OPERATION_ENABLED]
+        for index in enabled:
+            self._image.command(index, cia402.QUICK_STOP)
+        if enabled and self._open and not self._silent:
+            self._link.send(self._image.frames())

@@ -55,8 +55,9 @@ class SharedCan:
         self._open = False
         for end in self._ends:
             if end.is_open:
-                end.is_open = False
+                # Of several buses some may be left: a driver may say its last word to them.
                 end.on_lost(reason)
+                end.is_open = False
 
 
 class SharedEnd:

@@ -82,21 +82,21 @@ class Drives:
             self._report(index)
 
     # set-points --------------------------------------------------------------------------------------------------
-    def advance(self, t_s: float, elapsed_s: float, standing_mm: Callable[[], Array]) -> Array:
-        """Set-points (m,) reached at `t_s`, `elapsed_s` after the last SYNC or own step.
+    def advance(self, t_s: float, since_s: float, dt_s: float, standing_mm: Callable[[], Array]) -> Array:
+        """Set-points (m,) reached at `t_s`, `since_s` after the last SYNC and `dt_s` after the last step.
 
         A drive reaches its target one cycle after the SYNC that brought it, in a straight line. `standing_mm()` gives
         the encoder positions, asked only while something special happens.
         """
         self._standing_mm = standing_mm
-        if self.forces.pressing.any():
-            self.forces.note(standing_mm(), elapsed_s)
-        if elapsed_s >= 0.75 * self.cycle_s:
+        if self.forces.pressing.any() and dt_s > 0.0:
+            self.forces.note(standing_mm(), dt_s)
+        if since_s >= 0.75 * self.cycle_s:
             self._now = self._goal
         else:
-            self._now = self._start + (self._goal - self._start) * (elapsed_s / self.cycle_s)
+            self._now = self._start + (self._goal - self._start) * (since_s / self.cycle_s)
         if self.busy:
-            self._work(t_s, elapsed_s, standing_mm())
+            self._work(t_s, dt_s, standing_mm())
         return self._now
 
     def latch(self, rows: NDArray[np.intp], target_mm: Array) -> None:

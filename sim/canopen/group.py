@@ -1,4 +1,4 @@
-"""DriveGroup: all CANopen nodes of a cell as one station on the bus, around the one plant."""
+"""DriveGroup: all CANopen nodes of one bus as one station on it, around the one plant."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from sim.canopen.faults import DriveFaults
 from sim.canopen.faulty_wire import FaultyWire
 from sim.canopen.heartbeats import Heartbeats
 from sim.canopen.node import PRE_OPERATIONAL, Node
+from sim.canopen.parameters import BoolArray
 from sim.canopen.plant_axes import NEWTON_PER_COUNT, PlantAxes
 from sim.canopen.settings import DriveSettings
 from sim.wires.can_frames import CanEnd, CanFrame
@@ -46,8 +47,8 @@ class DriveGroup:
         self._plant, self._loop, self._settings = plant, loop, settings
         self._link = FaultyWire(link, loop)
         self._counts_per_mm = cell.bus.counts_per_mm
-        self._axes = cell.axis_names
-        self.faults = DriveFaults(self, self._link, self._axes, self._counts_per_mm)
+        self.axes = cell.axis_names
+        self.faults = DriveFaults(self, self._link, self.axes, self._counts_per_mm)
         self.drives = Drives(plant.encoder_mm(), cell.bus.cycle_s, settings, self.emergency)
         numbers = [axis.node or 0 for p in cell.positioners for axis in p.axes]
         self.nodes = [Node(i, number, settings, self) for i, number in enumerate(numbers)]
@@ -97,18 +98,18 @@ class DriveGroup:
     # faults that scenarios switch on -------------------------------------------------------------------------------
     def mute(self, axis: str, muted: bool = True) -> None:
         """Cut one node off: it neither hears nor speaks."""
-        index = self._axes.index(axis)
+        index = self.axes.index(axis)
         (self.muted.add if muted else self.muted.discard)(index)
         self.remap()
 
     def trip(self, axis: str, code: int, torque_lost: bool = False) -> None:
         """Let one drive fault with an emergency code."""
-        self.drives.trip(self._axes.index(axis), code, self._loop.time(), torque_lost)
+        self.drives.trip(self.axes.index(axis), code, self._loop.time(), torque_lost)
         self._cached = None
 
     def restart(self, axis: str) -> None:
         """Let one node reset by itself: torque off, boot-up, pre-operational, factory settings."""
-        self.reset_node(self.nodes[self._axes.index(axis)])
+        self.reset_node(self.nodes[self.axes.index(axis)])
 
     def now_s(self) -> float:
         """The drives' own clock."""
@@ -231,12 +232,19 @@ class DriveGroup:
         cycle_s = self.drives.cycle_s
         came_s = now_s - self._waiting * cycle_s
         self._waiting = max(0, self._waiting - 1)
-        return max(came_s, self._step_s + _SHORTEST_CYCLES * cycle_s)
+        return max(came_s, self._sync_s + _SHORTEST_CYCLES * cycle_s, self._step_s)
+
+    def at(self, t_s: float) -> tuple[Array, BoolArray, BoolArray]:
+        """Set-points, torque and brakes (m,) at `t_s`: for a plant that drives on another bus bring on."""
+        drives, t_s = self.drives, max(t_s, self._step_s)
+        set_point = drives.advance(t_s, t_s - (self._sync_s or 0.0), t_s - self._step_s, self._plant.encoder_mm)
+        self._step_s, self._cached = t_s, None
+        return set_point, drives.powered, drives.braked
 
     def _advance(self, now_s: float) -> None:
         plant, drives = self._plant, self.drives
-        elapsed_s = now_s - self._step_s
-        set_point = drives.advance(now_s, elapsed_s, plant.encoder_mm)
+        since_s = now_s - (self._sync_s or 0.0)
+        set_point = drives.advance(now_s, since_s, now_s - self._step_s, plant.encoder_mm)
         self._press()
         plant.step(now_s, set_point, drives.powered, drives.braked)
         if not plant.at_rest():

@@ -124,11 +124,11 @@ def test_a_drive_that_interpolates_no_more_holds_its_last_point() -> None:
         await ramp(bench, start, 5)
         drives, loop = bench.drives.drives, asyncio.get_running_loop()
         drives.control(4, 0x0F, loop.time())
-        held = drives.advance(loop.time(), 0.0, bench.plant.encoder_mm)[4]
+        held = drives.advance(loop.time(), 0.0, 0.0, bench.plant.encoder_mm)[4]
         assert not drives.following[4]
         assert not drives.statuswords[4] & 1 << 12
         drives.latch(np.array([4]), np.array([held + 1.0]))
-        assert drives.advance(loop.time() + CYCLE_S, CYCLE_S, bench.plant.encoder_mm)[4] == held
+        assert drives.advance(loop.time() + CYCLE_S, CYCLE_S, CYCLE_S, bench.plant.encoder_mm)[4] == held
         bench.drives.close()
 
     run_virtual(main)

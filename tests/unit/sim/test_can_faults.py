@@ -200,7 +200,7 @@ def test_a_brake_that_does_not_move(closed, order):
         else:
             drives._enter(2, Stage.SWITCHED_ON, t_s)
         for step in range(20):
-            drives.advance(t_s + 0.01 * step, 0.01, bench.plant.encoder_mm)
+            drives.advance(t_s + 0.01 * step, 0.01, 0.01, bench.plant.encoder_mm)
         bench.drives.close()
         return list(drives.braked)
 
