@@ -15,7 +15,7 @@ from typing import Any
 import click
 
 from docking.cli_devices import devices, monitor
-from docking.cli_fit import fit, study_screening
+from docking.cli_fit import fit, study_pose, study_real, study_screening
 from docking.cli_guide import guide
 from docking.cli_survey import layout, network
 from docking.errors import (
@@ -266,6 +266,8 @@ def study_dock(cells: tuple[Path, ...], as_json: bool, **options: Any) -> int:
 
 cli.add_command(fit)
 study.add_command(study_screening)
+study.add_command(study_pose)
+study.add_command(study_real)
 cli.add_command(layout)
 cli.add_command(guide)
 cli.add_command(devices)

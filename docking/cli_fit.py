@@ -1,4 +1,4 @@
-"""Commands about poses: a fit to somebody's own points, and what the screening of points survives."""
+"""Commands about poses: a fit to somebody's own points, and the studies of screening, fit and real data."""
 
 from __future__ import annotations
 
@@ -50,6 +50,10 @@ def fit(nominal: Path, measured: Path, report: Path | None, as_json: bool, **opt
     from docking.fit_options import FitOptions
     from docking.fit_report import fit_json, fit_text, run_fit
 
+    if report is not None:
+        from docking.report.sheet import check_drawing
+
+        check_drawing()
     result = run_fit(nominal, measured, FitOptions(**options))  # type: ignore[arg-type]
     if report is not None:
         from docking.report.fit_page import write_fit_page
@@ -83,4 +87,56 @@ def study_screening(draws: int, workers: int | None, as_json: bool) -> int:
         print_json(result)
     else:
         print_text(study_text(result))
+    return EXIT_OK if result["held"] else EXIT_FAULT
+
+
+@click.command("pose")
+@click.option(
+    "--draws", type=click.IntRange(min=1), default=20000, show_default=True, help="Draws of every figure, 100 or more."
+)
+@click.option("--seed", type=int, default=1, show_default=True, help="Another seed draws other errors.")
+@click.option("--out", type=FILE, default=Path("studies/pose"), show_default=True, help="Folder of page and pictures.")
+@json_option
+def study_pose(draws: int, seed: int, out: Path, as_json: bool) -> int:
+    """Repeat the paper's study of the pose with many draws: Table 1, Fig. 2, Fig. 3, and where least squares may start.
+
+    Writes pose.html, pose.json and the pictures into the folder, prints every bar, and exits with 1 when one is missed.
+    The full number of draws takes about two minutes; bars are wider for fewer.
+
+    \b
+    Example: docking study pose --draws 2000 --out /tmp/pose
+    """
+    from docking.report.sheet import check_drawing
+
+    check_drawing()
+    from docking.study_pose import study_pose, study_text
+    from docking.study_pose.page import write_study
+
+    result = study_pose(draws, seed, lambda text: print_text(text, err=True))
+    page = write_study(result, out)
+    if as_json:
+        print_json(result)
+    else:
+        print_text(f"{study_text(result)}\n{page}")
+    return EXIT_OK if result["held"] else EXIT_FAULT
+
+
+@click.command("real-data")
+@click.argument("folder", type=FILE)
+@json_option
+def study_real(folder: Path, as_json: bool) -> int:
+    """Fit other people's published measurements under FOLDER and compare with what they published.
+
+    Needs the folders faro_epochs, helmert3d and clas12_svt as their authors publish them. Exits with 1 on a difference.
+
+    \b
+    Example: docking study real-data ../shared/data
+    """
+    from docking.study_real import real_text, study_real
+
+    result = study_real(folder)
+    if as_json:
+        print_json(result)
+    else:
+        print_text(real_text(result))
     return EXIT_OK if result["held"] else EXIT_FAULT

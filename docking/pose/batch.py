@@ -55,6 +55,26 @@ def fit_poses(nominal_mm: Array, measured_mm: Array, weights: Array | None = Non
     return PoseBatch(R, t)
 
 
+def three_point_poses(nominal_mm: Array, measured_mm: Array, triangle: tuple[int, int, int]) -> PoseBatch:
+    """[Luo] Eq. 5-8 for every epoch of `measured_mm` (B, n, 3): poses from the corners A, B, C of `nominal_mm` (n, 3).
+
+    The corners must span a triangle, as `fit_three_point` needs it for one epoch.
+    """
+    R_12, c_12 = _triangle_frames(nominal_mm[None, list(triangle)])
+    R_32, c_32 = _triangle_frames(measured_mm[:, list(triangle)])
+    R = R_32 @ R_12[0].T
+    return PoseBatch(R, c_32 - R @ c_12[0])
+
+
+def _triangle_frames(corners_mm: Array) -> tuple[Array, Array]:
+    """Axes (B, 3, 3) and origins (B, 3) of frame 2 of the corners (B, 3, 3) A, B, C: see `triangle_frame`."""
+    a, b, c = (corners_mm[:, k] for k in range(3))
+    y = (a - c) / np.linalg.norm(a - c, axis=1, keepdims=True)
+    across = (b - c) - np.sum((b - c) * y, axis=1, keepdims=True) * y
+    x = across / np.linalg.norm(across, axis=1, keepdims=True)
+    return np.stack([x, y, np.cross(x, y)], axis=2), c
+
+
 def _gathering(w: Array, centred_mm: Array) -> Array:
     """(3n, 12): one product with the epochs' coordinates gives H = sum w (J - J') P^T row by row, and the centroid.
 

@@ -8,30 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from docking.errors import FileUnwritable
 from docking.fit_report import FitResult, fit_json, judgement_lines
 from docking.pose.uncertainty import total_cov_mm2
 from docking.report.figures import COLOURS, GREY, LIMIT, WIDTH_IN, panels, style, svg
+from docking.report.sheet import table, write_sheet
 from docking.types import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PAGE = """<!DOCTYPE html>
-<html lang="en"><head><meta charset="utf-8"><meta name="color-scheme" content="light dark"><title>{title}</title>
-<style>
-:root{{--ink:#1c1c1c;--soft:#5c5c5c;--rule:#d3d3d3;--paper:#fff;--bad:#b00020}}
-@media (prefers-color-scheme:dark){{:root{{--ink:#e8e8e8;--soft:#a9a9a9;--rule:#4a4a4a;--paper:#161616;--bad:#ff7b8b}}}}
-body{{font:15px/1.45 sans-serif;max-width:60em;margin:2em auto;padding:0 1em;color:var(--ink);background:var(--paper)}}
-svg{{width:100%;height:auto}} svg text{{fill:var(--ink)!important}} h2{{margin-top:2em}}
-figcaption,.soft{{color:var(--soft)}} .bad{{color:var(--bad);font-weight:600}} .wide{{overflow-x:auto}}
-table{{border-collapse:collapse;font-variant-numeric:tabular-nums;font-size:.9em}}
-th,td{{padding:.15em .6em;text-align:right;border-bottom:1px solid var(--rule)}} .t{{text-align:left}}
-</style></head>
-<body><h1>{title}</h1>
-{body}
-</body></html>
-"""
 _SHARE = 0.15
 """Length of the longest drawn residual, as a share of the part's extent."""
 
@@ -45,10 +30,7 @@ def write_fit_page(result: FitResult, title: str, path: Path) -> None:
     parts += _rejected("Rejected points", answer["rejected"]) + _rejected(
         "Readings left out", answer["dropped_readings"]
     )
-    try:
-        path.write_text(PAGE.format(title=escape(title), body="\n".join(parts)), encoding="utf-8")
-    except OSError as error:
-        raise FileUnwritable(str(path), error.strerror or str(error)) from error
+    write_sheet(title, parts, path)
 
 
 def _fitted(result: FitResult, answer: dict[str, Any]) -> list[str]:
@@ -66,7 +48,7 @@ def _fitted(result: FitResult, answer: dict[str, Any]) -> list[str]:
         *(f"<p>{escape(line)}</p>" for line in lines),
         "<h2>Pose of the nominal in the measured frame</h2>",
         '<p class="soft">R = Rz(gamma) Ry(beta) Rx(alpha)</p>',
-        _table(["", "value", "1 sigma"], rows),
+        table(["", "value", "1 sigma"], rows),
         "<h2>Residuals</h2>",
         f"<figure>{vectors}<figcaption>Measured minus fitted at every used point, {factor:.3g} times its true length, "
         "in the nominal frame; crosses are rejected points at their nominal place.</figcaption></figure>",
@@ -139,20 +121,11 @@ def _residual_table(result: FitResult) -> str:
         [name, *(f"{v:+.4f}" for v in r), f"{float(np.linalg.norm(r)):.4f}", *(f"{v:.4f}" for v in own)]
         for name, r, own in zip(result.fit.names, result.fit.residuals_mm, sigma, strict=True)
     ]
-    return _table(["point", "dx / mm", "dy / mm", "dz / mm", "length / mm", "sigma x", "sigma y", "sigma z"], rows)
+    return table(["point", "dx / mm", "dy / mm", "dz / mm", "length / mm", "sigma x", "sigma y", "sigma z"], rows)
 
 
 def _rejected(title: str, rows: list[dict[str, str]]) -> list[str]:
     if not rows:
         return []
     cells = [[row["name"], row["reason"], row["detail"]] for row in rows]
-    return [f"<h2>{title}</h2>", _table(["point", "reason", "what was seen"], cells, words=True)]
-
-
-def _table(head: list[str], rows: list[list[str]], *, words: bool = False) -> str:
-    def cells(tag: str, values: list[str]) -> str:
-        marks = (' class="t"' if words or k == 0 else "" for k in range(len(values)))
-        return "".join(f"<{tag}{mark}>{escape(v)}</{tag}>" for mark, v in zip(marks, values, strict=True))
-
-    body = "".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
-    return f'<div class="wide"><table><thead><tr>{cells("th", head)}</tr></thead><tbody>{body}</tbody></table></div>'
+    return [f"<h2>{title}</h2>", table(["point", "reason", "what was seen"], cells, words=True)]
