@@ -21,7 +21,7 @@ from docking.pose.passes import Averaged, average_passes
 from docking.pose.quantiles import chi2_tail
 from docking.pose.reasons import Reasons, explain
 from docking.pose.settings import FitSettings
-from docking.pose.snooping import Pairs, Tested, residuals_mm, snoop
+from docking.pose.snooping import Pairs, Tested, all_agree, residuals_mm, snoop
 from docking.pose.svd import fit_svd, mirrored_rms_mm
 from docking.types import Array, Points, Rejection, Screened
 
@@ -225,7 +225,8 @@ def _check_mirror(pairs: Pairs, graph: _Graph, settings: FitSettings) -> None:
 def _best(pairs: Pairs, graph: _Graph, settings: FitSettings) -> tuple[Tested, list[int]]:
     """The consistent set that explains the points best, snooped, and the rows of a rival as good (none: empty).
 
-    All cliques of the largest size and one below it compete; in a large graph the largest only.
+    All cliques of the largest size and one below it compete; in a large graph the largest only. All points together
+    compete too where each passes the test: the pairs alone never cost a clean set a point.
     """
     n, scaled = len(pairs.names), graph.sigma_mm is not None
     cliques = [graph.clique]
@@ -233,6 +234,8 @@ def _best(pairs: Pairs, graph: _Graph, settings: FitSettings) -> tuple[Tested, l
         least = max(len(graph.clique) - 1, MIN_POINTS)
         cliques += [c for c in map(bits, maximal_cliques(graph.adj, least, _RIVALS)) if c != graph.clique]
     found: dict[tuple[int, ...], Tested] = {}
+    if len(graph.clique) < n and not scaled and (whole := all_agree(pairs, settings)) is not None:
+        found[tuple(whole.kept)] = whole
     for clique in cliques:
         if clique is graph.clique or spread(pairs.nominal_mm[clique]).middle_mm > _least_middle_mm(pairs):
             tested = snoop(pairs, clique, settings, scaled)

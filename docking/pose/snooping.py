@@ -21,6 +21,9 @@ from docking.types import Array
 
 _ROUNDS = 40
 _LEAST_SCALED = 4
+_POINTS_SHARE = 0.8
+"""Share of the permitted false alarms that the test of single points may spend; the rest is for the choice among sets
+and the global test, which see the same noise in other combinations."""
 
 
 class Pairs(NamedTuple):
@@ -113,6 +116,21 @@ def _weighted_squares(pairs: Pairs, kept: list[int]) -> Array:
     return result
 
 
+def _level(settings: FitSettings) -> float:
+    """Level of all tests of single points of one set together."""
+    return _POINTS_SHARE * settings.false_alarm
+
+
+def all_agree(pairs: Pairs, settings: FitSettings) -> Tested | None:
+    """All pairs together, where the test of known covariances finds nothing wrong with any of them; else None."""
+    everyone = list(range(len(pairs.names)))
+    solution = solve(pairs, settings.expansion_sigma)
+    ratio = _ratio(pairs, everyone, _statistics(pairs, solution, everyone), _level(settings), False)
+    if not bool(np.all(ratio <= 1.0)):
+        return None
+    return Tested(everyone, solution, ratio, 0, _chi_square(pairs, solution))
+
+
 def snoop(pairs: Pairs, kept: list[int], settings: FitSettings, scaled: bool) -> Tested:
     """Move points in or out of the kept set, the clearest case first, until all agree with the test.
 
@@ -123,7 +141,7 @@ def snoop(pairs: Pairs, kept: list[int], settings: FitSettings, scaled: bool) ->
     least = max(settings.min_agreeing, _LEAST_SCALED) if scaled else settings.min_agreeing
     for _ in range(_ROUNDS):
         solution = solve(pairs.rows(kept), settings.expansion_sigma)
-        ratio = _ratio(pairs, kept, _statistics(pairs, solution, kept), settings.false_alarm, scaled)
+        ratio = _ratio(pairs, kept, _statistics(pairs, solution, kept), _level(settings), scaled)
         worst = max(kept, key=lambda i: ratio[i])
         outside = [i for i in range(len(ratio)) if i not in kept and i not in banned]
         nearest = min(outside, key=lambda i: ratio[i], default=None)
