@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from docking.errors import BadArgument, NotLocalised
 from docking.geometry import exp_so3
 from docking.guidance import guided
-from docking.guidance.features import Features, extract
+from docking.guidance.features import Features, extract, grey
+from docking.guidance.marker_pose import locate_by_markers
 from docking.guidance.opencv import opencv
 from docking.guidance.pose_only import CameraFit, Sights, refine, seen_sigma_mm
-from docking.guidance.types import ArMap, Camera, Image
+from docking.guidance.types import ArMap, Camera, Image, MarkerLayout
 from docking.guidance.vocabulary import Bags, bags_of, train
 from docking.types import Array, Pose
 
@@ -40,6 +41,7 @@ class LocaliseSettings:
     """What makes a pose believable, and how far it is searched.
 
     `map_sigma_mm` is the least standard deviation of a mapped place; the map's own figure counts where it is larger.
+    `by_markers`: where the map does not help, markers in view may give the pose, and the pose says so.
     """
 
     candidates: int = 8
@@ -52,6 +54,7 @@ class LocaliseSettings:
     most_rms_px: float = 3.5
     map_sigma_mm: float = 1.0
     limit_mm: float = 10.0
+    by_markers: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +130,7 @@ class Localiser:
 
     def localise(self, image: Image, hint: Pose | None = None) -> Localised:
         """The pose of one image (h, w) or (h, w, 3). Raises NotLocalised with the cause, BadArgument, ExtraMissing."""
-        return self.locate(self.features(image), hint)
+        return self.locate(image, self.features(image), hint)
 
     def features(self, image: Image) -> Features:
         """The features of an image of this camera, if worth a search. Raises NotLocalised, BadArgument."""
@@ -142,14 +145,33 @@ class Localiser:
             raise NotLocalised("image", cause, value=len(features.keypoints_px), limit=self.settings.least_features)
         return features
 
-    def locate(self, features: Features, hint: Pose | None = None) -> Localised:
-        """The pose of an image from its features: near the hint first, then anywhere in the map."""
+    def locate(self, image: Image, features: Features, hint: Pose | None = None) -> Localised:
+        """The pose of an image and its features: near the hint, else anywhere in the map, else by markers in view."""
+        try:
+            return self._in_map(features, hint)
+        except NotLocalised:
+            layout = self.ar_map.layout
+            if not self.settings.by_markers or layout is None:
+                raise
+            try:
+                return self._by_markers(image, layout)
+            except NotLocalised:
+                pass
+            raise
+
+    def _in_map(self, features: Features, hint: Pose | None) -> Localised:
         if hint is not None:
             try:
                 return self._settled(features, hint)
             except NotLocalised:
                 pass  # The camera may have been carried elsewhere: the whole map is searched.
         return self._anywhere(features)
+
+    def _by_markers(self, image: Image, layout: MarkerLayout) -> Localised:
+        fit, sights = locate_by_markers(grey(image), layout, self.camera)
+        depth = float(np.median(fit.X_WC.inverse().apply(sights.points_mm)[:, 2]))
+        seen, sigma = int(np.count_nonzero(fit.inside)), self.settings.map_sigma_mm
+        return Localised(fit.X_WC, fit.cov, "marker", seen, len(sights), fit.rms_px, depth, sigma, 0.0, self.camera)
 
     def _anywhere(self, features: Features) -> Localised:
         first: NotLocalised | None = None

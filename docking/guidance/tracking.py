@@ -48,7 +48,7 @@ class Tracker:
         self.counts.frames += 1
         try:
             features = self.localiser.features(image)
-            found = self.localiser.locate(features, self._predicted(t_s))
+            found = self.localiser.locate(image, features, self._predicted(t_s))
         except NotLocalised:
             self.counts.losses += int(bool(self._past))
             self._past, self._anchor = [], None
@@ -66,7 +66,7 @@ class Tracker:
         Poses stay in the frame of the cell; a registered device stays registered. Raises MapFrameDiffers for a map that
         is not in that frame, or whose markers stand at other places.
         """
-        _check_same_frame(self.localiser.ar_map, index.ar_map)
+        check_same_frame(self.localiser.ar_map, index.ar_map)
         self.localiser = Localiser(index, self.localiser.camera, self.localiser.settings)
         self._anchor = None
 
@@ -96,7 +96,8 @@ class Tracker:
             self._anchor = None
 
 
-def _check_same_frame(now: ArMap, then: ArMap) -> None:
+def check_same_frame(now: ArMap, then: ArMap) -> None:
+    """Raises MapFrameDiffers unless poses in the map `then` mean the same as in `now`: markers at the same places."""
     if then.frame != "cell":
         raise MapFrameDiffers(
             "map", "it is in a frame of its own, not in that of the cell", value=then.frame, limit="cell"

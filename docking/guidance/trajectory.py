@@ -6,9 +6,9 @@ axes x right, y down, z forward. Inside the program lengths are mm.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,3 +160,21 @@ def _umeyama(p: Array, q: Array, *, with_scale: bool) -> tuple[float, Array, Arr
     R = (u * signs) @ vt
     scale = float(d @ signs / np.mean(np.sum((p - p0) ** 2, axis=1))) if with_scale else 1.0
     return scale, R, q0 - scale * R @ p0
+
+
+def error_text(error: TrajectoryError) -> str:
+    """The figures for a person, the alignment first."""
+    how = {"none": "not aligned", "se3": "aligned (SE3)", "sim3": f"aligned (Sim3, scale {error.scale:.6f})"}[
+        error.align
+    ]
+    return (
+        f"{how}: ATE rmse {error.ate_rmse_m:.6f} m, median {error.median_m:.6f} m, max {error.max_m:.6f} m; "
+        f"{error.localised} common moments of {error.poses} poses and {error.frames} true ones"
+    )
+
+
+def error_json(error: TrajectoryError) -> dict[str, Any]:
+    """The figures as JSON; `ate_rmse_m`, `median` and `max` in m."""
+    figures = asdict(error)
+    figures["median"], figures["max"] = figures.pop("median_m"), figures.pop("max_m")
+    return figures
