@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 from docking.assemble import RunRequest, dry_run
+from tests.support.shared_data import shared_data
 
 ROOT = Path(__file__).parents[2]
-SURVEY = ROOT.parent / "shared" / "data" / "clas12_svt" / "survey_measured_reformat.dat"
+SURVEY = shared_data("clas12_svt", "survey_measured_reformat.dat")
 CELL = ROOT / "sim" / "cells" / "lab-can.toml"
 LAB_JOB = ROOT / "sim" / "cells" / "lab-can.job.toml"
-
-pytestmark = pytest.mark.skipif(not SURVEY.exists(), reason="the shared survey data are not beside the checkout")
 
 
 def barrel() -> dict[str, tuple[float, float, float]]:

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from docking.fit_report import fit_files
+from tests.support.shared_data import shared_data
 
-DATA = Path(__file__).parents[2].parent / "shared" / "data"
+DATA = shared_data()
 BASE, TOOL = ("base_1", "base_2", "base_3"), ("SMR_1", "SMR_2", "SMR_3")
-pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"the real data are not at {DATA}")
 
 
 def write(path: Path, rows: list[tuple[str, np.ndarray]]) -> Path:
