@@ -203,6 +203,8 @@ def job_document_findings(doc: Document) -> list[Finding]:
     """Duplicates, order of the stages and the start in a JOB document."""
     measured = ("component.targets[].name", "component.check_points[].name", "mate.targets[].name")
     return [
+        *duplicates(entries(doc, "instructions[].name"), "name"),
+        *duplicates(entries(doc, "instructions[].order"), "place in the order"),
         *duplicates((e for path in measured for e in entries(doc, path)), "name"),
         *duplicates(entries(doc, "component.features[].name"), "name"),
         *duplicates(entries(doc, "component.balls[].positioner"), "positioner"),
