@@ -11,6 +11,7 @@ from docking.terminal import FILE, json_option, print_json, print_text
 
 NOISE = "Where MEASURED has no sigmas: iso:MM, tracker:X,Y,Z, total-station:X,Y,Z (station in the measured frame, mm)."
 LOCK = "Entries of the pose that are held: x,y,z,alpha,beta,gamma, each with =VALUE (mm or deg) where it is not 0."
+WEIGHTS = "NAME=WEIGHT,...: the point counts as if its variance were that much smaller; before a column `weight`."
 TEMPERATURE = "Nominal points grow: kelvins above their reference, and expansion, as in 2.5@23.1e-6."
 
 
@@ -29,6 +30,7 @@ TEMPERATURE = "Nominal points grow: kelvins above their reference, and expansion
 @click.option(
     "--exclude", metavar="NAMES", multiple=True, help="Points left out before anything else: P1,P2 (repeatable)."
 )
+@click.option("--weights", metavar="LIST", help=WEIGHTS)
 @click.option("--temperature", metavar="DT_K@ALPHA_PER_K", help=TEMPERATURE)
 @click.option("--triangle", metavar="A,B,C", help="Corners for --method three-point (default: the largest triangle).")
 @click.option("--report", type=FILE, help="Write residual vectors, histogram and tables to this HTML file.")
@@ -37,14 +39,15 @@ def fit(nominal: Path, measured: Path, report: Path | None, as_json: bool, **opt
     """Fit the pose that takes NOMINAL points into MEASURED coordinates (CSV files).
 
     Points that cannot be right are named with a reason and left out; where no answer is safe there is none, and the
-    exit code is 1. Header of the files: name,x_mm,y_mm,z_mm[,sx_mm,sy_mm,sz_mm]; passes of a point are rows of the same
-    name; (0,0,0) is a lost beam.
+    exit code is 1. Header of the files: name,x_mm,y_mm,z_mm[,sx_mm,sy_mm,sz_mm][,weight]; passes of a point are rows of
+    the same name; (0,0,0) is a lost beam.
 
     \b
     Example: docking fit nominal.csv measured.csv
       docking fit nominal.csv measured.csv --noise tracker:0,-9000,800 --report fit.html
       docking fit nominal.csv measured.csv --noise iso:0.05 --lock z,alpha=0.5 --json
       docking fit nominal.csv measured.csv --temperature 2.5@23.1e-6 --exclude T3,T7
+      docking fit nominal.csv measured.csv --method svd --weights T1=4,T2=0.25
       docking fit nominal.csv measured.csv --method three-point --triangle A,B,C
     """
     from docking.fit_options import FitOptions

@@ -23,7 +23,7 @@ _LARGEST_EXPANSION_PER_K = 1e-3
 
 @dataclass(frozen=True)
 class FitOptions:
-    """The options of `docking fit` as they are typed; `noise`, `lock`, `temperature` and `triangle` may be absent."""
+    """The options of `docking fit` as they are typed; all but the method may be absent."""
 
     method: str = "ml"
     noise: str | None = None
@@ -31,6 +31,7 @@ class FitOptions:
     exclude: tuple[str, ...] = field(default=())
     temperature: str | None = None
     triangle: str | None = None
+    weights: str | None = None
 
 
 def _number(text: str) -> float:
@@ -61,12 +62,29 @@ def locks_from(spec: str | None) -> tuple[tuple[Freedom, float], ...]:
     return tuple(found)
 
 
+def weights_from(spec: str | None) -> dict[str, float]:
+    """Weights by name of `NAME=WEIGHT,...`. Raises BadArgument."""
+    found: dict[str, float] = {}
+    for part in spec.split(",") if spec is not None else []:
+        name, _, text = (piece.strip() for piece in part.rpartition("="))
+        weight = _number(text)
+        if not name or name in found or not (0.0 < weight < np.inf):
+            raise BadArgument("--weights", "NAME=WEIGHT,... is needed, each point once, weights above 0", value=part)
+        found[name] = weight
+    return found
+
+
 def _names_of(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
-def settings_from(options: FitOptions, nominal: Points, measured: Points) -> FitSettings:
-    """The settings of screening and fit. Raises BadArgument, also for a name that neither file knows."""
+def settings_from(
+    options: FitOptions, nominal: Points, measured: Points, written: dict[str, float] | None = None
+) -> FitSettings:
+    """The settings of screening and fit; `written` are the weights in the files, `--weights` goes before them.
+
+    Raises BadArgument, also for a name that neither file knows.
+    """
     if options.method not in METHODS:
         raise BadArgument("--method", f"choose one of {', '.join(METHODS)}", value=options.method)
     locks, corners = locks_from(options.lock), _names_of(options.triangle or "")
@@ -74,14 +92,23 @@ def settings_from(options: FitOptions, nominal: Points, measured: Points) -> Fit
         raise BadArgument("--lock", "only --method ml holds degrees of freedom", value=options.method)
     if options.triangle is not None and (len(set(corners)) != 3 or options.method != "three-point"):
         raise BadArgument("--triangle", "three names are needed, with --method three-point", value=options.triangle)
+    asked = weights_from(options.weights)
+    weights = {**(written or {}), **asked}
+    if weights and options.method == "three-point":
+        raise BadArgument("--weights", "three points are met as they are; no weight changes that", value=options.method)
     excluded = tuple(dict.fromkeys(name for text in options.exclude for name in _names_of(text)))
-    for option, names in (("--exclude", excluded), ("--triangle", corners)):
+    for option, names in (("--exclude", excluded), ("--triangle", corners), ("--weights", tuple(asked))):
         for name in names:
             if name not in nominal.names and name not in measured.names:
                 raise BadArgument(option, "neither file has a point of this name", value=name)
     triangle = (corners[0], corners[1], corners[2]) if corners else None
     return FitSettings(
-        method=cast(Method, options.method), where="fit", locks=locks, excluded=excluded, triangle=triangle
+        method=cast(Method, options.method),
+        where="fit",
+        locks=locks,
+        excluded=excluded,
+        triangle=triangle,
+        weights=tuple(weights.items()),
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from docking.errors import PoseError
 from docking.fit_options import FitOptions, expansion_from, prepared, settings_from
 from docking.geometry import matrix_to_euler, skew
-from docking.point_file import read_points
+from docking.point_file import read_points, read_weights
 from docking.pose import fit_pose, screen
 from docking.pose.locks import turning_axes
 from docking.pose.quantiles import chi2_tail
@@ -60,7 +60,8 @@ def run_fit(nominal_path: str | Path, measured_path: str | Path, options: FitOpt
     options = FitOptions() if options is None else options
     nominal = read_points(Path(nominal_path), "nominal")
     measured = read_points(Path(measured_path), "measured")
-    settings = settings_from(options, nominal, measured)
+    written = {**read_weights(Path(nominal_path)), **read_weights(Path(measured_path))}
+    settings = settings_from(options, nominal, measured, written)
     nominal, measured = prepared(options, nominal, measured)
     known = bool(np.all(np.isfinite(nominal.cov_mm2)) and np.all(np.isfinite(measured.cov_mm2)))
     given = expansion_from(options.temperature)

@@ -1,4 +1,5 @@
-"""Point files: CSV with the header `name,x_mm,y_mm,z_mm` and, optionally, `sx_mm,sy_mm,sz_mm` (1 sigma a coordinate).
+"""Point files: CSV with the header `name,x_mm,y_mm,z_mm` and, optionally, `sx_mm,sy_mm,sz_mm` (1 sigma a coordinate)
+and `weight` (how much more the point counts in a fit).
 
 A point measured in several passes appears in several rows. Every fault names the line, the column and the value.
 """
@@ -18,7 +19,9 @@ from docking.types import Points
 
 _COORDINATES = ("x_mm", "y_mm", "z_mm")
 _SIGMAS = ("sx_mm", "sy_mm", "sz_mm")
-_HEADERS = (("name", *_COORDINATES), ("name", *_COORDINATES, *_SIGMAS))
+_WEIGHT = "weight"
+_PLAIN, _FULL = ("name", *_COORDINATES), ("name", *_COORDINATES, *_SIGMAS)
+_HEADERS = (_PLAIN, _FULL, (*_PLAIN, _WEIGHT), (*_FULL, _WEIGHT))
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _LARGEST_MM = 1e7
 _MOST_NAMES = 2000
@@ -51,8 +54,9 @@ def _number(path: Path, line: int, column: str, text: str) -> float:
     value = float(text) if _NUMBER.fullmatch(text) else float("nan")
     if not (abs(value) <= _LARGEST_MM):
         _bad(path, f"line {line}, column {column}: {text!r}", "a finite decimal number of mm is needed")
-    if column in _SIGMAS and not (value > 0.0):
-        _bad(path, f"line {line}, column {column}: {text!r}", "a standard deviation is greater than zero")
+    if column in (*_SIGMAS, _WEIGHT) and not (value > 0.0):
+        what = "a weight" if column == _WEIGHT else "a standard deviation"
+        _bad(path, f"line {line}, column {column}: {text!r}", f"{what} is greater than zero")
     return value
 
 
@@ -109,7 +113,26 @@ def read_points(path: Path, role: Role) -> Points:
         values.append([_number(path, line, column, text) for column, text in zip(header[1:], fields[1:], strict=True)])
     if len(first_line) > _MOST_NAMES:
         _bad(path, f"{len(first_line)} points", f"at most {_MOST_NAMES} are screened")
-    return _points(names, np.array(values, dtype=np.float64).reshape(len(names), len(header) - 1), passes)
+    table = np.array(values, dtype=np.float64).reshape(len(names), len(header) - 1)
+    return _points(names, table[:, : len(_FULL) - 1] if _SIGMAS[0] in header else table[:, :3], passes)
+
+
+def read_weights(path: Path) -> dict[str, float]:
+    """The weights of a point file by name; none where it has no such column.
+
+    Raises FileUnreadable, BadPointFile also where the passes of a point differ in weight.
+    """
+    rows = _rows(path)
+    header = _header(path, rows)
+    weights: dict[str, float] = {}
+    if header[-1] != _WEIGHT:
+        return weights
+    for line, fields in rows[1:]:
+        weight = _number(path, line, _WEIGHT, fields[-1])
+        if weights.setdefault(fields[0], weight) != weight:
+            where = f"line {line}, column {_WEIGHT}: {fields[-1]!r}"
+            _bad(path, where, f"{fields[0]} has the weight {weights[fields[0]]:g} further up; a point has one")
+    return weights
 
 
 def _points(names: list[str], table: np.ndarray[tuple[int, int], np.dtype[np.float64]], passes: list[int]) -> Points:

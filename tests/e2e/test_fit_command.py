@@ -140,6 +140,46 @@ def test_a_stated_temperature_grows_the_nominal(fitted: Fitted) -> None:
     assert "deformed: growth" in cold[1]["refused"] or "nominal shape" in cold[1]["refused"]
 
 
+def off_mm(told: dict[str, Any], name: str) -> float:
+    return float(np.linalg.norm(told["residuals_mm"][name]))
+
+
+@pytest.mark.parametrize("method", ["ml", "svd", "least-squares"])
+def test_a_heavy_point_pulls_and_a_light_one_gives_way(fitted: Fitted, method: str) -> None:
+    noise = ("--noise", "iso:0.05", "--method", method)
+    plain, heavy, light = (
+        fitted(seen(), *noise, *extra)[1] for extra in ((), ("--weights", "T4=1e6"), ("--weights", "T4=1e-6"))
+    )
+    assert off_mm(heavy, "T4") < 1e-3 * off_mm(plain, "T4")
+    assert off_mm(light, "T4") > 1.05 * off_mm(plain, "T4")
+    without = fitted(seen(), *noise, "--exclude", "T4")[1]
+    assert [light["pose"][k] for k in SIX] == pytest.approx([without["pose"][k] for k in SIX], abs=1e-4)
+
+
+def test_a_column_of_weights_is_the_option(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A weight of 4 is half the sigma; the option goes before the column; passes of a point have one weight."""
+    n, m = points(tmp_path / "n.csv", J), points(tmp_path / "m.csv", seen())
+    head, *rows = m.read_text().splitlines()
+    column = tmp_path / "w.csv"
+
+    def run(file: Path, *options: str) -> dict[str, Any]:
+        call(["fit", str(n), str(file), "--noise", "iso:0.05", *options, "--json"])
+        told: dict[str, Any] = json.loads(capsys.readouterr().out)
+        return told
+
+    column.write_text("\n".join([head + ",weight", *(row + (",4" if k < 3 else ",1") for k, row in enumerate(rows))]))
+    by_option = run(m, "--weights", "T1=4,T2=4,T3=4")
+    assert run(column)["pose"] == by_option["pose"] != run(m)["pose"]
+    assert run(column, "--weights", "T1=1,T2=1,T3=1")["pose"] == run(m)["pose"]
+    stated = tmp_path / "s.csv"
+    cells = (row + (",0.025" * 3 if k < 3 else ",0.05" * 3) for k, row in enumerate(rows))
+    stated.write_text("\n".join([head + ",sx_mm,sy_mm,sz_mm", *cells]))
+    assert run(stated)["chi2"] == pytest.approx(by_option["chi2"], rel=1e-6)
+    column.write_text("\n".join([head + ",weight", *(row + ",2" for row in rows), rows[0] + ",3"]))
+    error = run(column)["error"]
+    assert (error["code"], error["where"]) == (4003, str(column))
+
+
 def test_three_points_have_no_redundancy(fitted: Fitted) -> None:
     told = fitted(seen(), *TRACKER, "--exclude", ",".join(NAMES[3:]))[1]
     assert (told["redundancy"], told["used"]) == (0, ["T1", "T2", "T3"])
@@ -159,6 +199,12 @@ def test_three_points_have_no_redundancy(fitted: Fitted) -> None:
         (("--temperature", "5"), "--temperature"),
         (("--temperature", "5@0"), "--temperature"),
         (("--temperature", "nan@1e-5"), "--temperature"),
+        (("--weights", "T1"), "--weights"),
+        (("--weights", "T1=0"), "--weights"),
+        (("--weights", "T1=nan"), "--weights"),
+        (("--weights", "T1=2,T1=3"), "--weights"),
+        (("--weights", "T99=2"), "--weights"),
+        (("--weights", "T1=2", "--method", "three-point"), "--weights"),
         (("--triangle", "T1,T2,T3"), "--triangle"),
         (("--method", "three-point", "--triangle", "T1,T2"), "--triangle"),
         (("--method", "three-point", "--triangle", "T1,T2,X"), "--triangle"),
