@@ -23,13 +23,20 @@ FASTEST_BAUD = 19200
 """Above this speed the gap stays as it is."""
 
 
+def _shifted(byte: int) -> int:
+    for _ in range(8):
+        byte = byte >> 1 ^ 0xA001 * (byte & 1)
+    return byte
+
+
+_SHIFTED = tuple(map(_shifted, range(256)))
+
+
 def crc16(data: bytes) -> int:
     """CRC of a frame, to be sent low byte first: "01 04 02 FF FF" gives 80B8h, sent as B8 80."""
     crc = 0xFFFF
     for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ 0xA001 * (crc & 1)
+        crc = crc >> 8 ^ _SHIFTED[(crc ^ byte) & 0xFF]
     return crc
 
 

@@ -23,7 +23,8 @@ def units_of(
     """A fresh unit for each positioner, not yet connected. `link` takes the place of the cell's serial port."""
     if bus.line is None:
         return [_tcp_unit(p.name, addresses[p.name], p.unit or 1, bus, tap) for p in cell.positioners]
-    line = RtuLine(link or SerialPort(bus.line, bus.baud, "Modbus line"), bus.line, bus.baud, bus.timeout_s)
+    port = link or SerialPort(bus.line, bus.baud, "Modbus line", bus.framing)
+    line = RtuLine(port, bus.line, bus.baud, bus.timeout_s)
     return [line.unit(f"positioner {p.name}", p.unit or 1) for p in cell.positioners]
 
 

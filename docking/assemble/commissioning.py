@@ -11,7 +11,6 @@ from docking.assemble.controller import tracker_of
 from docking.assemble.looking import Ends, LookRequest, load_looked_at, wires_of
 from docking.assemble.real_time import run_real
 from docking.assemble.timed import TimedCan, TimedSerial
-from docking.assemble.wires import transcribed_line
 from docking.config import CellFile
 from docking.config.cell import CanBus
 from docking.errors import DockingError, LinkError
@@ -37,9 +36,9 @@ def find_devices(request: LookRequest, *, prove: bool = False) -> dict[str, Any]
         async with wires_of(request, cell) as ends:
             rows = [await _tracker(cell, ends)]
             skew = None
-            if ends.can is not None:
-                rows += await _bus(cell, ends.can)
-            look = ModbusLook(cell, ends.modbus, ends.tap, transcribed_line(cell, ends.transcript))
+            if ends.bus.can is not None:
+                rows += await _bus(cell, ends.bus.can)
+            look = ModbusLook(cell, ends.bus.modbus, ends.tap, ends.bus.line)
             try:
                 rows += await look.find()
                 skew = await look.start_skew_s()
@@ -85,12 +84,12 @@ async def _prove(cell: CellFile, ends: Ends) -> tuple[DockingError | None, tuple
     read-backs of one SYNC."""
     positioners: CanopenPositioners | ModbusPositioners
     timed: TimedCan | None = None
-    if isinstance(cell.bus, CanBus) and ends.can is not None:
+    if isinstance(cell.bus, CanBus) and ends.bus.can is not None:
         nodes = [axis.node or 0 for p in cell.positioners for axis in p.axes]
-        timed = TimedCan(ends.can, frozenset(0x180 + node for node in nodes))
+        timed = TimedCan(ends.bus.can, frozenset(0x180 + node for node in nodes))
         positioners = CanopenPositioners(cell, timed)
     else:
-        positioners = ModbusPositioners(cell, ends.modbus, ends.tap, transcribed_line(cell, ends.transcript))
+        positioners = ModbusPositioners(cell, ends.bus.modbus, ends.tap, ends.bus.line)
     problem = None
     try:
         await positioners.bring_up()

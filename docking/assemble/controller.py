@@ -66,7 +66,7 @@ def build_cell(
     """The whole controller of one docking; without `motion` the motion side runs on this very loop."""
     positioners = positioners_from(cell, job)
     if motion is None:
-        motion = motion_beside(cell, local_motion(cell, job, wires.can, wires.modbus))
+        motion = motion_beside(cell, local_motion(cell, job, wires))
     survey = Survey(
         tracker=tracker_of(cell, wires.serial),
         journal=company.journal,

@@ -10,10 +10,10 @@ from pathlib import Path
 
 from docking.assemble.requests import WireChoice, opened, read_wires
 from docking.assemble.simulated import make_far_end, real_wires, truth_of
-from docking.assemble.wires import Addresses, near_bus, transcribed_can
+from docking.assemble.wires import NearBus, near_bus
 from docking.config import CellFile
 from docking.config.load import default_job_path, load_cell, load_job
-from docking.ports import CanLink, SerialLink
+from docking.ports import SerialLink
 from docking.transcript import TranscribedSerial, Transcript
 from drivers.links.serial_port import SerialPort
 
@@ -34,8 +34,7 @@ class Ends:
 
     port: str
     serial: SerialLink
-    can: CanLink | None
-    modbus: Addresses | None
+    bus: NearBus
     transcript: Transcript | None
 
     @property
@@ -63,12 +62,10 @@ async def wires_of(request: LookRequest, cell: CellFile) -> AsyncIterator[Ends]:
         transcript = opened(request.transcript)
         port = str(found.get("tracker", cell.tracker.port))
         serial: SerialLink = SerialPort(port, cell.tracker.baud)
-        can, modbus = near_bus(cell, found)
         if transcript is not None:
             stack.callback(transcript.close)
             serial = TranscribedSerial(serial, transcript, "tracker")
-            can = transcribed_can(can, transcript) if can is not None else None
-        yield Ends(port, serial, can, modbus, transcript)
+        yield Ends(port, serial, near_bus(cell, found).transcribed(transcript), transcript)
 
 
 def load_looked_at(request: LookRequest) -> CellFile:

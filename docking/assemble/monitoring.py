@@ -9,7 +9,6 @@ from typing import Any
 
 from docking.assemble.looking import Ends, LookRequest, load_looked_at, wires_of
 from docking.assemble.real_time import on_interrupt, run_real
-from docking.assemble.wires import transcribed_line
 from docking.config import CellFile
 from docking.config.cell import CanBus
 from docking.config.inputs import InputsConfig
@@ -42,8 +41,8 @@ async def _watch(
     on_interrupt(asked_to_end.set)
     loop = asyncio.get_running_loop()
     began_s = loop.time()
-    bus = BusLook(cell, ends.can) if ends.can is not None else None
-    modbus = ModbusLook(cell, ends.modbus, ends.tap, transcribed_line(cell, ends.transcript))
+    bus = BusLook(cell, ends.bus.can) if ends.bus.can is not None else None
+    modbus = ModbusLook(cell, ends.bus.modbus, ends.tap, ends.bus.line)
     try:
         if bus is not None:
             await bus.open()

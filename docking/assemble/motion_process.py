@@ -45,7 +45,7 @@ def run_motion(cell_file: Path, job_file: Path, found: dict[str, Any], channel: 
     if "transcript" in found:
         transcript = Transcript(Path(found["transcript"]), asyncio.get_running_loop().time)
         atexit.register(transcript.close)
-    motion = local_motion(cell, job, *near_bus(cell, found), transcript)
+    motion = local_motion(cell, job, near_bus(cell, found), transcript)
     return ServedMotion(motion, channel, service_settings(cell), lambda: _measure(cell))
 
 

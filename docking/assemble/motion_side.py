@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import math
+from dataclasses import replace
 
-from docking.assemble.wires import Addresses, transcribed_can, transcribed_line
+from docking.assemble.wires import Addresses, NearBus
 from docking.config import CellFile, JobFile
 from docking.config.cell import ModbusBus
 from docking.config.inputs import InputsConfig, ModbusModule
@@ -15,7 +16,6 @@ from docking.motion.guarded import GuardedMotion, InputRules
 from docking.motion.monitors import watch_from
 from docking.motion.remote import LeaseSettings, RemoteMotion
 from docking.motion.served import LocalMotion, ServedMotion, ServiceSettings
-from docking.ports import CanLink
 from docking.transcript import Transcript
 from drivers.canopen.io_module import CanIoModule
 from drivers.canopen.positioners import CanopenPositioners
@@ -27,33 +27,26 @@ from drivers.modbus_inputs import ModbusIoModule
 from drivers.modbus_positioners import ModbusPositioners
 
 
-def local_motion(
-    cell: CellFile, job: JobFile, can: CanLink | None, modbus: Addresses | None, transcript: Transcript | None = None
-) -> LocalMotion:
+def local_motion(cell: CellFile, job: JobFile, near: NearBus, transcript: Transcript | None = None) -> LocalMotion:
     """What drives the axes and reads the inputs, in the process that calls; `transcript` gets all bytes."""
-    inputs = cell.inputs
-    if transcript is not None and can is not None:
-        can = transcribed_can(can, transcript)
-    if inputs is None:
-        return _axes(cell, job, can, modbus, transcript)
-    shared = SharedCan(can) if can is not None else None
-    motion = _axes(cell, job, shared.end() if shared is not None else None, modbus, transcript)
+    inputs, near = cell.inputs, near.transcribed(transcript)
     tap = transcript.modbus if transcript is not None else None
-    modules = input_modules(inputs, shared, modbus, tap)
+    if inputs is None:
+        return _axes(cell, job, near, tap)
+    shared = SharedCan(near.can) if near.can is not None else None
+    motion = _axes(cell, job, replace(near, can=shared.end()) if shared is not None else near, tap)
+    modules = input_modules(inputs, shared, near.modbus, tap)
     return GuardedMotion(motion, WiredInputs(inputs, modules), input_rules(inputs))
 
 
-def _axes(
-    cell: CellFile, job: JobFile, can: CanLink | None, modbus: Addresses | None, transcript: Transcript | None
-) -> LocalMotion:
+def _axes(cell: CellFile, job: JobFile, near: NearBus, tap: Tap | None) -> LocalMotion:
     watch = watch_from(cell, job)
     if isinstance(cell.bus, ModbusBus):
-        tap = transcript.modbus if transcript is not None else None
-        positioners = ModbusPositioners(cell, modbus, tap, transcribed_line(cell, transcript))
+        positioners = ModbusPositioners(cell, near.modbus, tap, near.line)
         return QueuedMotion(positioners, watch, cell.bus.poll_s)
-    if can is None:
+    if near.can is None:
         raise ValueError("a CANopen cell needs the near end of its bus")
-    return StreamedMotion(CanopenPositioners(cell, can), watch, cell.limits.tick_late_cycles)
+    return StreamedMotion(CanopenPositioners(cell, near.can), watch, cell.limits.tick_late_cycles)
 
 
 def input_modules(

@@ -112,15 +112,17 @@ def _refuse_real_devices(path: Path, found: dict[str, Any]) -> None:
     listed = found.get("modbus")
     hosts = [str(at[0]) for at in listed.values() if at] if isinstance(listed, dict) else []
     far = [host for host in hosts if host not in LOOPBACK]
-    tracker = str(found.get("tracker", ""))
-    far += [tracker] if tracker and not tracker.startswith("/dev/pts/") else []
+    ports = [str(found.get(name, "")) for name in ("tracker", "line")]
+    far += [port for port in ports if port and not port.startswith("/dev/pts/")]
     far += [path for path in _bus_paths(found) if path and not Path(path).is_socket()]
     if far:
         raise BadArgument("--wires", f"{far[0]} is no simulated device of this machine", value=str(path))
 
 
 def _has_buses(cell: CellFile, found: dict[str, Any]) -> bool:
-    """A socket for the one CAN bus of the cell, or one for each of several."""
+    """The line of a cell on RTU; a socket for the one CAN bus of the cell, or one for each of several."""
+    if cell.bus.kind == "modbus-rtu":
+        return isinstance(found.get("line"), str)
     can, channels = found.get("can"), getattr(cell.bus, "channels", ())
     if len(channels) > 1:
         return isinstance(can, dict) and set(can) == set(channels)

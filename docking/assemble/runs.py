@@ -100,7 +100,7 @@ def run_on_wires(request: RunRequest, choice: WireChoice, say: Say, *, step: boo
             if transcript is not None:
                 serial = TranscribedSerial(serial, transcript, "tracker")
                 found = {**found, "transcript": str(transcript.path.resolve())}
-            wires, joined = Wires(serial), _Joined(process, found)
+            wires, joined = Wires(serial=serial), _Joined(process, found)
             try:
                 return await _dock(_Run(files, request, wires, operator, path, far, choice.sim, joined, step))
             finally:

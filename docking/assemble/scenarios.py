@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from docking.assemble.simulated import FarEnd, truth_path
+from docking.assemble.wires import LINE
 from docking.cell import Cell
 from docking.config import CellFile, JobFile
 from docking.errors import BadArgument, ConfigInvalid
@@ -41,6 +42,8 @@ def runner_of(
     book = FaultBook(cell, far.plant, far.world, far.devices)
     if far.line is not None:
         book.line("tracker", far.line.unplug, far.line.replug)
+    if far.positioner_line is not None:
+        book.line(LINE, far.positioner_line.unplug, far.positioner_line.replug)
     known = Known()
     if job is not None:
         known = Known(tuple(state.value for state in State), tuple(stage.name for stage in job.stages))

@@ -11,12 +11,11 @@ import numpy as np
 
 from docking.assemble.controller import Wires
 from docking.assemble.transcribed import TranscribedDevice, TranscribedStation
-from docking.assemble.wires import can_of
+from docking.assemble.wires import LINE, can_of
 from docking.config import CellFile, JobFile
 from docking.config.build import plan_period_s
 from docking.config.cell import CanBus, ModbusBus
 from docking.config.inputs import CanModule, ModbusModule
-from docking.errors import BadArgument
 from docking.transcript import Transcript
 from sim.canopen.group import DriveGroup
 from sim.canopen.io_module import IoModule
@@ -32,7 +31,7 @@ from sim.tracker.geocom import GeocomStation
 from sim.tracker.line import LineTrackerDevice
 from sim.truth import TruthFile, load_truth
 from sim.wires.can_frames import CanEnd
-from sim.wires.pacing import DeviceEnd
+from sim.wires.pacing import DeviceEnd, character_bits
 from sim.wires.pty_serial import PtySerial
 from sim.wires.shared_end import SharedEnd
 from sim.wires.unix_can import UnixCanServer
@@ -65,6 +64,7 @@ class FarEnd:
     world: InputWorld
     devices: list[Any] = field(default_factory=list)
     line: VirtualSerial | None = None
+    positioner_line: VirtualSerial | None = None
     transcript: Transcript | None = None
     shares: PlantShares | None = None
 
@@ -103,15 +103,22 @@ class FarEnd:
 
     async def plcs(self, cell: CellFile, addresses: dict[str, tuple[str, int]] | None) -> dict[str, tuple[str, int]]:
         """Let the positioner PLCs listen; return their addresses."""
-        if cell.bus.kind == "modbus-rtu":
-            raise BadArgument("bus.kind", "PLCs are simulated at TCP addresses only", value=cell.bus.kind)
+        group = self._plc_group(cell)
+        group.tap = self.transcript.modbus if self.transcript is not None else None
+        return {**await group.serve(addresses), **await self.modbus_inputs(cell, LOCAL if addresses else None)}
+
+    def plc_line(self, cell: CellFile, wire: DeviceEnd) -> None:
+        """Put the positioner PLCs on one serial line, each by its unit."""
+        if isinstance(cell.bus, ModbusBus):
+            self.devices.append(self._plc_group(cell).serve_line(wire, cell.bus.baud))
+
+    def _plc_group(self, cell: CellFile) -> PlcGroup:
         names = [p.name for p in cell.positioners]
         skew_s = cell.bus.start_skew_s if isinstance(cell.bus, ModbusBus) else 0.0
         late_s = np.random.default_rng([self.seed, len(names)]).uniform(0.0, skew_s, len(names)).tolist()
         group = PlcGroup(self.plant, cell, [self.plant.clock_ppm[n] for n in names], self.loop, late_s)
         self.devices.append(group)
-        group.tap = self.transcript.modbus if self.transcript is not None else None
-        return {**await group.serve(addresses), **await self.modbus_inputs(cell, LOCAL if addresses else None)}
+        return group
 
     async def modbus_inputs(self, cell: CellFile, host: str | None = None) -> dict[str, tuple[str, int]]:
         """Let the Modbus I/O modules listen, at the addresses of the cell or at free ports of `host`."""
@@ -152,8 +159,13 @@ async def virtual_wires(cell: CellFile, far: FarEnd) -> Wires:
     far.tracker(cell, serial.far)
     if isinstance(cell.bus, CanBus):
         can = can_of(cell, await virtual_buses(cell, far))
-        return Wires(serial.near, can=can, modbus=await far.modbus_inputs(cell))
-    return Wires(serial.near, modbus=await far.plcs(cell, None))
+        return Wires(serial=serial.near, can=can, modbus=await far.modbus_inputs(cell))
+    if cell.bus.line is None:
+        return Wires(serial=serial.near, modbus=await far.plcs(cell, None))
+    bits = character_bits(cell.bus.framing)
+    far.positioner_line = line = VirtualSerial(far.loop, cell.bus.baud, "Modbus line", bits)
+    far.plc_line(cell, line.far)
+    return Wires(serial=serial.near, modbus=await far.modbus_inputs(cell), line=line.near)
 
 
 async def virtual_buses(cell: CellFile, far: FarEnd) -> dict[str, VirtualCanEnd]:
@@ -178,6 +190,8 @@ async def real_wires(cell: CellFile, far: FarEnd, folder: Path, transcript: Tran
     far.tracker(cell, TranscribedDevice(serial, transcript, "tracker") if transcript is not None else serial)
     far.devices.append(serial)
     found: dict[str, Any] = {"cell": cell.name, "tracker": serial.path}
+    if isinstance(cell.bus, ModbusBus) and cell.bus.line is not None:
+        return {**found, **await _real_line(cell, cell.bus, far)}
     if isinstance(cell.bus, ModbusBus):
         addresses = {p.name: (LOCAL, 0) for p in cell.positioners}
         found["modbus"] = {name: list(at) for name, at in (await far.plcs(cell, addresses)).items()}
@@ -197,3 +211,13 @@ async def real_wires(cell: CellFile, far: FarEnd, folder: Path, transcript: Tran
     if beside:
         found["modbus"] = beside
     return found
+
+
+async def _real_line(cell: CellFile, bus: ModbusBus, far: FarEnd) -> dict[str, Any]:
+    """The positioner PLCs on one pty, Modbus inputs at free loopback ports; their addresses."""
+    line = PtySerial(far.loop, bus.baud, bits=character_bits(bus.framing))
+    line.open()
+    far.plc_line(cell, TranscribedDevice(line, far.transcript, LINE) if far.transcript is not None else line)
+    far.devices.append(line)
+    inputs = {name: list(at) for name, at in (await far.modbus_inputs(cell, LOCAL)).items()}
+    return {"line": line.path, **({"modbus": inputs} if inputs else {})}

@@ -82,6 +82,9 @@ class DriveScale(Model):
     )
 
 
+Framing = Literal["8N1", "8N2", "8E1", "8O1"]
+
+
 class CanBus(Model):
     kind: Literal["canopen"] = Field(description="twelve or fewer CiA 402 drives that take one position each cycle")
     interface: str = Field(description="python-can interface name, such as socketcan")
@@ -134,7 +137,10 @@ class ModbusBus(Model):
     )
     line: str | None = Field(default=None, description="modbus-rtu: serial port of all positioners, any pyserial URL")
     baud: Annotated[int, Field(ge=9600, le=1_000_000)] = Field(
-        default=115200, description="modbus-rtu: speed of the line, 8 data bits, no parity, 1 stop bit, bit/s"
+        default=115200, description="modbus-rtu: speed of the line, bit/s"
+    )
+    framing: Framing = Field(
+        default="8N1", description="modbus-rtu: data bits, parity (None, Even, Odd), stop bits of a character"
     )
     segment_s: Annotated[float, Field(ge=0.02, le=0.5)] = Field(
         default=0.1, description="duration of one queued segment, s"

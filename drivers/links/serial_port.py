@@ -59,16 +59,17 @@ def _ignore(_: object) -> None:
 
 
 class SerialPort:
-    """`docking.ports.SpeedLink` over pyserial: 8 data bits, no parity, 1 stop bit, no flow control.
+    """`docking.ports.SpeedLink` over pyserial: no flow control; `framing` is data bits, parity, stop bits.
 
     Error `where` is `name`, the device at the far end.
     """
 
-    def __init__(self, url: str, baud: int, name: str = "tracker") -> None:
+    def __init__(self, url: str, baud: int, name: str = "tracker", framing: str = "8N1") -> None:
         self.on_bytes: Callable[[bytes], None] = _ignore
         self.on_lost: Callable[[str], None] = _ignore
         self.dropped_bytes = 0
         self._url, self._baud, self._name = url, baud, name
+        self._bits, self._parity, self._stop_bits = int(framing[0]), framing[1], int(framing[2])
         self._port: serial.Serial | None = None
         self._thread: threading.Thread | None = None
         self._loop: asyncio.AbstractEventLoop
@@ -94,7 +95,14 @@ class SerialPort:
         # pyserial's RFC 2217 client refuses a write time-out; its writes go to a socket that buffers.
         write_wait_s = None if self._url.lower().startswith("rfc2217:") else WRITE_WAIT_S
         return serial.serial_for_url(
-            self._url, baudrate=self._baud, timeout=READ_WAIT_S, write_timeout=write_wait_s, exclusive=True
+            self._url,
+            baudrate=self._baud,
+            bytesize=self._bits,
+            parity=self._parity,
+            stopbits=self._stop_bits,
+            timeout=READ_WAIT_S,
+            write_timeout=write_wait_s,
+            exclusive=True,
         )
 
     def write(self, data: bytes) -> None:

@@ -19,13 +19,18 @@ FASTEST_GAP_S = 0.00175
 """Above 19200 bits/s the specification keeps this gap."""
 
 
+_EIGHT_BITS = []
+for _remainder in range(256):
+    for _ in range(8):
+        _remainder = (_remainder >> 1) ^ (0xA001 if _remainder & 1 else 0)
+    _EIGHT_BITS.append(_remainder)
+
+
 def crc16(data: bytes) -> bytes:
     """CRC of `data` as it stands at the end of a frame: "01 03 00 00 00 01" gives "84 0A"."""
     crc = 0xFFFF
     for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
+        crc = (crc >> 8) ^ _EIGHT_BITS[(crc ^ byte) & 0xFF]
     return crc.to_bytes(2, "little")
 
 

@@ -1,4 +1,4 @@
-"""The speed of a serial line: bytes arrive when their last bit has, at 10 bits a byte (8N1)."""
+"""The speed of a serial line: bytes arrive when their last bit has, at 10 bits a byte (8N1) where nothing is said."""
 
 from __future__ import annotations
 
@@ -7,6 +7,11 @@ from collections.abc import Callable
 from typing import Protocol
 
 BITS_PER_BYTE = 10
+
+
+def character_bits(framing: str) -> int:
+    """Bits of one character with its start bit: "8N1" has 10, "8E1" 11."""
+    return 1 + int(framing[0]) + (framing[1] != "N") + int(framing[2])
 
 
 class DeviceEnd(Protocol):
@@ -28,9 +33,15 @@ class SpeedEnd(DeviceEnd, Protocol):
 class PacedChannel:
     """One direction of a line: chunks queue behind each other, each delivered whole when its last byte is through."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, baud: int, deliver: Callable[[bytes], None]) -> None:
-        self._loop, self._deliver = loop, deliver
-        self._byte_s = BITS_PER_BYTE / baud
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        baud: int,
+        deliver: Callable[[bytes], None],
+        bits: int = BITS_PER_BYTE,
+    ) -> None:
+        self._loop, self._deliver, self._bits = loop, deliver, bits
+        self._byte_s = bits / baud
         self._free_at_s = 0.0
         self._epoch = 0
 
@@ -42,7 +53,7 @@ class PacedChannel:
 
     def set_baud(self, baud: int) -> None:
         """Change the speed for what is sent from now on."""
-        self._byte_s = BITS_PER_BYTE / baud
+        self._byte_s = self._bits / baud
 
     def cut(self) -> None:
         """Lose every byte that is still under way."""

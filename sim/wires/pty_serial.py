@@ -15,7 +15,7 @@ import tty
 from collections.abc import Callable
 from pathlib import Path
 
-from sim.wires.pacing import PacedChannel
+from sim.wires.pacing import BITS_PER_BYTE, PacedChannel
 
 CHUNK = 4096
 
@@ -34,15 +34,21 @@ class PtySerial:
     `link` is the stable name to make (a symbolic link to the slave), or None; `path` is what a client opens.
     """
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, baud: int, link: Path | None = None) -> None:
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        baud: int,
+        link: Path | None = None,
+        bits: int = BITS_PER_BYTE,
+    ) -> None:
         self.on_bytes: Callable[[bytes], None] = _ignore
         self.on_break: Callable[[], None] = _deaf
         self.path = ""
         self.lost_bytes = 0
         self._loop, self._link = loop, link
         self._master = self._keeper = -1
-        self._to_client = PacedChannel(loop, baud, self._send)
-        self._to_device = PacedChannel(loop, baud, self._receive)
+        self._to_client = PacedChannel(loop, baud, self._send, bits)
+        self._to_device = PacedChannel(loop, baud, self._receive, bits)
 
     def open(self) -> None:
         """Create the terminal and start to listen."""

@@ -12,7 +12,7 @@ import random
 from collections.abc import Callable
 
 from docking.errors import LinkLost, PortMissing
-from sim.wires.pacing import PacedChannel
+from sim.wires.pacing import BITS_PER_BYTE, PacedChannel
 
 
 def _ignore(_: object) -> None:
@@ -91,14 +91,20 @@ class FarEnd:
 
 
 class VirtualSerial:
-    """One line of `baud` bits/s with its two ends, on the time of `loop`."""
+    """One line of `baud` bits/s and so many `bits` a character, with its two ends, on the time of `loop`."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, baud: int, name: str = "virtual serial line") -> None:
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        baud: int,
+        name: str = "virtual serial line",
+        bits: int = BITS_PER_BYTE,
+    ) -> None:
         self.name = name
         self.missing = False
         self.near, self.far = HostEnd(self), FarEnd(self)
-        self.to_device = PacedChannel(loop, baud, lambda data: self.far.deliver(self._heard(data)))
-        self.to_host = PacedChannel(loop, baud, lambda data: self.near.deliver(self._heard(data)))
+        self.to_device = PacedChannel(loop, baud, lambda data: self.far.deliver(self._heard(data)), bits)
+        self.to_host = PacedChannel(loop, baud, lambda data: self.near.deliver(self._heard(data)), bits)
         self._host_baud = self._device_baud = baud
         self._noise = random.Random(baud)
 

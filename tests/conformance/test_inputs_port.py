@@ -84,7 +84,7 @@ async def test_the_real_modules(check: Check, request: pytest.FixtureRequest) ->
     cell = load_cell(Path(request.config.getoption("--hardware")))
     if cell.inputs is None or not cell.inputs.digital or not cell.inputs.temperatures:
         pytest.skip("this cell has no wired contact and sensor")
-    link, _ = near_bus(cell, {})
+    link = near_bus(cell, {}).can
     contact, sensor = cell.inputs.digital[0], cell.inputs.temperatures[0]
     shared = SharedCan(link) if link is not None else None
     inputs = WiredInputs(cell.inputs, input_modules(cell.inputs, shared, None))

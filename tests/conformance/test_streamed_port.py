@@ -73,7 +73,7 @@ async def test_the_simulated_drives_over_a_local_socket(check: Check, tmp_path: 
 async def test_the_real_drives(check: Check, request: pytest.FixtureRequest) -> None:
     """Nothing is enabled."""
     cell = load_cell(Path(request.config.getoption("--hardware")))
-    link, _ = near_bus(cell, {})
+    link = near_bus(cell, {}).can
     if link is None:
         pytest.skip("the axes of this cell are not on CAN")
     axes = CanopenPositioners(cell, link)

@@ -14,7 +14,7 @@ from docking.assemble.motion_side import local_motion
 from docking.assemble.requests import RunRequest
 from docking.assemble.runs import dry_run
 from docking.assemble.simulated import make_far_end, truth_of
-from docking.assemble.wires import can_of
+from docking.assemble.wires import NearBus, can_of
 from docking.config.build import plan_settings
 from docking.config.check import check_cell
 from docking.config.load import load_cell, load_job
@@ -83,7 +83,7 @@ async def two_buses(tmp_path, change=lambda cell: cell, transcript=None) -> Seen
         near[name].send = tapped
     can = can_of(change(cell), near)
     assert isinstance(can, ChannelledCan)
-    motion = local_motion(change(cell), job, can, None, transcript)
+    motion = local_motion(change(cell), job, NearBus(can), transcript)
     return Seen(sent, plant, buses, near, motion, can)
 
 

@@ -95,9 +95,9 @@ class DryCell:
             far_end = self.bus.end()
             await far_end.open()
             self.far.drives(self.cell, far_end)
-            self.wires = Wires(self.serial.near, can=self.bus.end())
+            self.wires = Wires(serial=self.serial.near, can=self.bus.end())
         else:
-            self.wires = Wires(self.serial.near, modbus=await self.far.plcs(self.cell, None))
+            self.wires = Wires(serial=self.serial.near, modbus=await self.far.plcs(self.cell, None))
             for station, plc in zip(self.cell.positioners, self.plcs.plcs, strict=True):
                 self._watch_queue(station.name, plc)
         company = Company(self.journal, self.operator, self.loop.time)

@@ -16,6 +16,7 @@ import numpy as np
 from docking import records
 from docking.assemble.motion_side import local_motion
 from docking.assemble.simulated import FarEnd, make_far_end, truth_of
+from docking.assemble.wires import NearBus
 from docking.config import CellFile, JobFile
 from docking.config.build import positioners_from
 from docking.config.load import load_cell, load_job
@@ -101,7 +102,7 @@ class ReadyCell:
             send(frames)
 
         self.near.send = tapped  # type: ignore[method-assign]
-        self.motion: Any = local_motion(self.cell, self.job, self.near, None)
+        self.motion: Any = local_motion(self.cell, self.job, NearBus(self.near))
 
     @property
     def faults(self) -> DriveFaults:

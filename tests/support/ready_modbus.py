@@ -12,6 +12,7 @@ import numpy as np
 
 from docking.assemble.motion_side import local_motion
 from docking.assemble.simulated import make_far_end, truth_of
+from docking.assemble.wires import NearBus
 from docking.config import CellFile, JobFile
 from docking.config.build import positioners_from
 from docking.config.load import load_cell, load_job
@@ -84,7 +85,7 @@ class ReadyModbus:
         ppm = [self.plant.clock_ppm[p.name] for p in self.cell.positioners]
         late_s = np.linspace(0.0, 1.0, len(ppm)) * bus.start_skew_s
         self.group = PlcGroup(self.recorded, self.cell, ppm, self.loop, late_s.tolist())
-        motion = local_motion(self.cell, job, None, None)
+        motion = local_motion(self.cell, job, NearBus())
         assert isinstance(motion, QueuedMotion)
         self.motion = motion
         self.victim = self.group.plcs[1]

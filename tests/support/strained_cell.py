@@ -100,7 +100,7 @@ class ReliefCase:
     async def tare(self) -> Tare:
         """Weigh the part as it was taken, and switch off."""
         wires, settle = self.wires(), self.cell.settle
-        motion = motion_beside(self.cell, local_motion(self.cell, self.job, wires.can, wires.modbus))
+        motion = motion_beside(self.cell, local_motion(self.cell, self.job, wires))
         await motion.connect()
         await motion.enable()
         settings = SettleSettings(settle.window_s, settle.readings, settle.tolerance_mm, settle.timeout_s)
@@ -137,7 +137,7 @@ class ReliefCase:
         tap = Tap(journal, loop.time)
         tap.hooks.append(self.heard)
         operator = Supervisor(self.said.append, self.strained.steps, lambda number: self.strained.each(self))
-        motion = motion_beside(self.cell, local_motion(self.cell, self.job, wires.can, wires.modbus))
+        motion = motion_beside(self.cell, local_motion(self.cell, self.job, wires))
         company = Company(tap, operator, loop.time)
         self.controller = build_relief(Files(self.cell, self.job, journal), motion, company, "A. Smith", tare)
         watching = asyncio.ensure_future(self.watch())
@@ -157,9 +157,9 @@ async def _wired(cell: CellFile, far: FarEnd) -> Callable[[], Wires]:
         end = bus.end()
         await end.open()
         far.drives(cell, end)
-        return lambda: Wires(serial.near, can=bus.end())
+        return lambda: Wires(serial=serial.near, can=bus.end())
     addresses = await far.plcs(cell, None)
-    return lambda: Wires(serial.near, modbus=addresses)
+    return lambda: Wires(serial=serial.near, modbus=addresses)
 
 
 def relieved(strained: Strained, journal: Path) -> ReliefCase:
