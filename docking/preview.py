@@ -75,8 +75,11 @@ class Preview:
                 scene=Scene(here, self._mate, self._docked, stage.standoff_mm, before_mm),
             )
             plan = make_plan(request, self.positioners, self.settings)
-            yield StageMove(stage, plan, jam_bound(self.positioners, plan.q_mm[[0, -1]], self.settings.jam))
+            yield StageMove(stage, plan, self._jam(plan))
             here, q_mm, before_mm = moved_pose(here, correction), plan.q_mm[-1], stage.standoff_mm
+
+    def _jam(self, plan: Plan) -> JamBound:
+        return jam_bound(self.positioners, plan.q_mm[[0, -1]], self.settings.jam, self.settings.load.up)
 
     def _station(self, standoff_mm: float) -> Pose:
         axis_W = self._mate.R @ self.settings.mate.axis_M
@@ -182,10 +185,10 @@ def move_text(move: StageMove) -> str:
             f"  mate: {bounds.clearance_mm:.2f} mm clear where it is tightest (s = {bounds.clearance_s:.2f}), "
             f"{bounds.clearance_asked_mm:.2f} mm asked there"
         )
-    rows.append("  axis       move mm  peak mm/s  stroke left mm  speed left mm/s  jammed mm  jammed N")
+    rows.append("  axis       move mm  peak mm/s  stroke left mm  speed left mm/s  jammed mm  jammed N  warp N")
     for k, (axis, room, speed) in enumerate(plan.margins):
         rows.append(
             f"  {axis:<8}{plan.displacement_mm[k]:>10.3f}{bounds.peak_mm_s[k]:>11.3f}{room:>16.2f}{speed:>17.3f}"
-            f"{bounds.jam_mm[k]:>11.4f}{bounds.jam_n[k]:>10.0f}"
+            f"{bounds.jam_mm[k]:>11.4f}{bounds.jam_n[k]:>10.0f}{bounds.jam_warp_n[k]:>8.0f}"
         )
     return "\n".join(rows)

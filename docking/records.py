@@ -117,6 +117,7 @@ def bounds_record(axes: tuple[str, ...], bounds: PlanBounds) -> dict[str, Any]:
         "quick_stop_s": bounds.quick_stop_s,
         "jam_mm": by_axis(bounds.jam_mm),
         "jam_n": by_axis(bounds.jam_n),
+        "jam_warp_n": by_axis(bounds.jam_warp_n),
         "ramp_mm": by_axis(bounds.ramp_mm),
         "residual_mm": bounds.residual_mm,
         "force_n": bounds.force_n,

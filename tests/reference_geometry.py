@@ -16,7 +16,7 @@ BALLS = np.array([[-3000, -1800, -1200], [3000, -1800, -1200], [3000, 1800, -120
 FACE = np.array([4000.0, 0.0, 0.0])
 LOAD = Load(6000.0, 0.0, np.array([600.0, 200.0, 0.0]), np.zeros(3), np.array([0.0, 0.0, -9.80665]))
 GUARDED = PlanSettings(load=LOAD)
-SETTINGS = replace(GUARDED, jam=JamSettings(residual_mm=1e9, force_n=1e12))
+SETTINGS = replace(GUARDED, jam=JamSettings(residual_mm=1e9, force_n=1e12, warp_n=1e12))
 """The limits of the axes and the stage alone; GUARDED bounds what a jammed axis may do as well."""
 
 

@@ -47,7 +47,7 @@ def make_plan(request: PlanRequest, positioners: Positioners, settings: PlanSett
     path = rigid_path(positioners, request.q_now_mm, request.correction)
     room = check_strokes(path, positioners, settings)
     check_attitudes(pose_from_axes(positioners, request.q_now_mm), request.correction, positioners, settings)
-    jam = jam_bound(positioners, path.axes_mm(np.array([0.0, 0.5, 1.0])), settings.jam)
+    jam = jam_bound(positioners, path.axes_mm(np.array([0.0, 0.5, 1.0])), settings.jam, settings.load.up)
     limits = PaceLimits(positioners, request.speed_mm_s, request.period_s, request.linear_interpolation, settings, jam)
     law, limited_by = fastest_law(path, limits)
     t_s = request.period_s * np.arange(round(law.duration_s / request.period_s) + 1, dtype=np.float64)
@@ -95,6 +95,7 @@ def _bounds(
         quick_stop_s=quick_stop_s,
         jam_mm=jam.jam_mm(peak_mm_s),
         jam_n=jam.jam_n(peak_mm_s),
+        jam_warp_n=jam.jam_warp_n(peak_mm_s),
         ramp_mm=jam.ramp_mm(peak_mm_s),
         residual_mm=strain.residual_mm,
         force_n=strain.force_n,

@@ -298,12 +298,13 @@ def _bounds(
     request: StepRequest, peak: Array, pace: tuple[str, float], positioners: Positioners, settings: PlanSettings
 ) -> PlanBounds:
     """What a jammed axis would cost. A straight step has no chord error, and what the mate asks is not its concern."""
-    jam = jam_bound(positioners, request.q_now_mm, settings.jam)
+    jam = jam_bound(positioners, request.q_now_mm, settings.jam, settings.load.up)
     return PlanBounds(
         peak_mm_s=peak,
         quick_stop_s=jam.quick_stop_s(peak),
         jam_mm=jam.jam_mm(peak),
         jam_n=jam.jam_n(peak),
+        jam_warp_n=jam.jam_warp_n(peak),
         ramp_mm=jam.ramp_mm(peak),
         residual_mm=0.0,
         force_n=0.0,

@@ -12,13 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from docking.errors import StrainForeseen
-from docking.kinematics import (
-    Positioners,
-    internal_force_matrix,
-    socket_positions,
-    warp_rows,
-)
-from docking.planning.jam import residual_matrix
+from docking.kinematics import Positioners, internal_force_matrix, socket_positions
+from docking.planning.jam import residual_matrix, warp_matrix
 from docking.planning.path import RigidPath
 from docking.planning.settings import PlanSettings
 from docking.types import Array
@@ -52,6 +47,7 @@ def foreseen_strain(path: RigidPath, s: Array, positioners: Positioners, setting
     for value, limit, what in (
         (found.residual_mm, settings.jam.residual_mm, "ball residual in mm"),
         (found.force_n, settings.jam.force_n, "internal force in N"),
+        (found.warp_n, settings.jam.warp_n, "warp in N"),
     ):
         if not value <= limit:
             cause = f"From the devices' interpolation and start; {100.0 * limit / value:.0f} % of the speed would fit."
@@ -61,11 +57,9 @@ def foreseen_strain(path: RigidPath, s: Array, positioners: Positioners, setting
 
 def _matrices(positioners: Positioners, q_mm: Array, settings: PlanSettings) -> tuple[Array, Array, Array]:
     """Ball residual (3k, m), ball force (3k, m) and warp (w, m) of axis errors."""
-    balls, up = socket_positions(positioners, q_mm), settings.load.up
-    force = internal_force_matrix(positioners, balls)
-    modes = warp_rows(balls, up)
-    vertical = np.einsum("wk,c->wkc", modes, up).reshape(len(modes), force.shape[1])
-    return residual_matrix(positioners, balls), force, vertical @ force
+    balls = socket_positions(positioners, q_mm)
+    warp = warp_matrix(positioners, balls, settings.load.up)
+    return residual_matrix(positioners, balls), internal_force_matrix(positioners, balls), warp
 
 
 def _size(flat: Array, width: int) -> Array:

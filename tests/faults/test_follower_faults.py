@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from docking.errors import AxisDrift, AxisStuck, BallUnloaded, EncoderJump
-from docking.types import Array
+from docking.types import Array, Plan
 from tests.support.motion_record import AS_SENT_MM, along
+from tests.support.planned_moves import a_shift, lab_site
 from tests.support.ready_cell import ReadyCell, Scene, play
 
 HELD_N, TOLERANCE_N = 13400.0, 268.0
@@ -17,7 +19,7 @@ K = 11
 Watched = list[tuple[float, float, float, float]]
 
 
-def move(seed: int, fault: str | None = None) -> tuple[ReadyCell, Array]:
+def move(scene: int | Scene, fault: str | None = None, share: float = 0.4) -> tuple[ReadyCell, Array]:
     """One move, D.Z failing after 40 % of it; rows of time, force and position of D.Z, largest internal force."""
     seen: Watched = []
 
@@ -33,9 +35,11 @@ def move(seed: int, fault: str | None = None) -> tuple[ReadyCell, Array]:
 
         cell.recorded.step = watched  # type: ignore[method-assign]
         if fault is not None:
-            cell.during(0.4, getattr(plant, fault), "D.Z")
+            cell.during(share, getattr(plant, fault), "D.Z")
 
-    cell = play(Scene("follower-force-can", seed=seed), story)
+    if isinstance(scene, int):
+        scene = Scene("follower-force-can", seed=scene)
+    cell = play(scene, story)
     rows = np.array(seen)
     return cell, rows[(rows[:, 0] >= cell.start_s) & (rows[:, 0] <= cell.ended_s)]
 
@@ -58,17 +62,65 @@ def test_it_keeps_its_force_through_a_move() -> None:
     assert abs(rows[-1, 2] - rows[0, 2]) == pytest.approx(travel, abs=0.1)
 
 
+@dataclass(frozen=True)
+class Lift:
+    """A straight lift of the part, asked at this speed; D.Z jams after `share` of its time."""
+
+    speed_mm_s: float
+    share: float = 0.5
+
+    @property
+    def way_mm(self) -> float:
+        return max(3.0, 3.0 * self.speed_mm_s)
+
+    def scene(self) -> Scene:
+        return Scene("follower-force-can", seed=2, before=lambda cell: setattr(cell, "plan_from", self.plan))
+
+    def plan(self, standing_mm: Array) -> Plan:
+        up = np.array([0.0, 0.0, self.way_mm])
+        return a_shift(lab_site("follower-force-can"), up, self.speed_mm_s, standing_mm)
+
+
+LIFTS = (
+    *(Lift(0.99, share) for share in (0.5, 0.505)),
+    Lift(8.0, 0.48),
+    *(Lift(speed, share) for speed in (0.3, 0.6, 0.9, 1.05, 1.5, 2.5, 8.0) for share in (0.35, 0.51)),
+)
+NOISE_N = 60.0
+"""What read-backs in micrometres and friction make of forces, whatever the axes do."""
+SPAN = 1.5
+"""The stated bound may be this much above the worst that is measured, as for axes that hold a position."""
+
+
 @pytest.mark.parametrize(("seed", "kind", "within_s"), [(2, AxisStuck, 0.1), (3, BallUnloaded, 0.3)])
 def test_jammed_it_stops_all_axes_on_the_path(seed: int, kind: type[Exception], within_s: float) -> None:
     """At 3 mm/s its encoder tells within the window, at 0.6 mm/s the load cell does with its second reading."""
-    cell, rows = move(seed, "jam")
+    cell, _ = move(seed, "jam")
     assert isinstance(cell.cause, kind), repr(cell.cause)
     assert cell.cause.where == "D.Z"
     assert cell.result is not None
     assert cell.result.stop is not None
     assert cell.result.stop.found_s - cell.fault_s < within_s
-    assert rows[:, 3].max() < cell.cell.limits.internal_force_n
     assert beside_the_path_mm(cell) < AS_SENT_MM
+
+
+def test_jammed_at_any_speed_it_strains_no_more_than_the_pre_flight_stated(request: pytest.FixtureRequest) -> None:
+    """The worst speed is the one that its window just does not see; the load cell needs two readings there."""
+    whole, shares = request.config.getoption("--full"), []
+    for lift in LIFTS if whole else LIFTS[:3]:
+        cell, rows = move(lift.scene(), "jam", lift.share)
+        assert cell.cause is not None
+        assert cell.plan.bounds is not None
+        stated_n = float(cell.plan.bounds.jam_n[K])
+        worst_n = float(rows[:, 3].max() - rows[rows[:, 0] < cell.fault_s, 3].max())
+        peak = cell.plan.bounds.peak_mm_s[K]
+        print(
+            f"D.Z jammed at {peak:.2f} mm/s, {lift.share} of the way: {worst_n:.0f} of {stated_n:.0f} N; {cell.cause}"
+        )
+        assert worst_n <= stated_n + NOISE_N
+        assert stated_n <= 1.001 * cell.cell.limits.internal_force_n
+        shares.append(stated_n / worst_n)
+    assert min(shares) <= SPAN
 
 
 def test_without_its_ball_in_a_move_it_stops_within_a_millimetre() -> None:

@@ -35,7 +35,7 @@ MOVES = {
 def site() -> Site:
     """The cell without what bounds the speed for a jam: straightness has to hold at the axes' own limits."""
     found = lab_site(CELL)
-    jam = replace(found.settings.jam, residual_mm=1e6, force_n=1e12)
+    jam = replace(found.settings.jam, residual_mm=1e6, force_n=1e12, warp_n=1e12)
     return replace(found, settings=replace(found.settings, jam=jam))
 
 

@@ -10,12 +10,9 @@ from docking.errors import AxisDrift, AxisStuck, EncoderJump, FollowingErrorTrip
 from docking.kinematics import Positioners
 from docking.motion.monitors.limits import Margins, Timing, WatchLimits
 from docking.motion.triggers import Finding, Trigger
+from docking.planning.settings import WINDOW, WINDOW_MM
 from docking.types import Array, Feedback
 
-WINDOW = 5
-"""Read-backs over which the command and the encoder are compared."""
-WINDOW_MM = 0.05
-"""Commanded travel in the window from which on the encoder must show it."""
 SLOWEST, FASTEST = 0.2, 2.0
 """Encoder travel as a fraction of the commanded: under it the axis is stuck, over it the encoder is not believed."""
 HALF = 0.5

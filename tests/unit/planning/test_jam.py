@@ -15,6 +15,7 @@ from docking.types import Array, Correction, Plan
 from tests.reference_geometry import FACE, GUARDED, NAMES, crooked_axes, rc1, rc3
 
 STIFFNESS = 20000.0
+UP = np.array([0.0, 0.0, 1.0])
 
 
 def moved(positioners: Positioners, shift: tuple[float, float, float], turn_deg: tuple[float, float, float]) -> Plan:
@@ -28,16 +29,17 @@ def sockets(positioners: Positioners, q: Array) -> Array:
     ])  # fmt: skip
 
 
-def distortion(balls: Array, figure: Array) -> tuple[float, float]:
-    """(largest ball residual, largest ball force) of four balls held at `balls` by equal springs: Kabsch by SVD."""
+def distortion(balls: Array, figure: Array) -> tuple[float, float, float]:
+    """(largest ball residual, largest ball force, warp) of four balls held at `balls` by equal springs: Kabsch."""
     a, b = figure - figure.mean(axis=0), balls - balls.mean(axis=0)
     u, _, vt = np.linalg.svd(a.T @ b)
     turn = vt.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))]) @ u.T
-    off = float(np.linalg.norm(b - a @ turn.T, axis=1).max())
-    return off, STIFFNESS * off
+    gap = b - a @ turn.T
+    off = float(np.linalg.norm(gap, axis=1).max())
+    return off, STIFFNESS * off, STIFFNESS * abs(float(gap[:, 2] @ [0.25, -0.25, 0.25, -0.25]))
 
 
-def jammed(positioners: Positioners, plan: Plan, k: int, at_s: float) -> tuple[float, float]:
+def jammed(positioners: Positioners, plan: Plan, k: int, at_s: float) -> tuple[float, float, float]:
     """Axis k stays where it is at `at_s`; after it hangs back by stuck_mm the others go on for the reaction time and
     then take their path rate to zero in a straight line of time, at a_quick of the fastest."""
     jam = GUARDED.jam
@@ -56,14 +58,20 @@ def jammed(positioners: Positioners, plan: Plan, k: int, at_s: float) -> tuple[f
 
 
 @pytest.mark.parametrize(
-    ("shift", "turn_deg"),
-    [((-60, 0, 0), (0, 0, 0)), ((0, 20, 0), (0, 0, 0)), ((0, 0, 30), (0, 0, 0)), ((-12, 8, 3), (0.2, -0.1, 0.4))],
+    ("shift", "turn_deg", "limit"),
+    [
+        ((-60, 0, 0), (0, 0, 0), "internal force"),
+        ((0, 20, 0), (0, 0, 0), "internal force"),
+        ((0, 0, 30), (0, 0, 0), "warp"),
+        ((-12, 8, 3), (0.0, -0.05, 0.4), "internal force"),
+        ((-12, 8, 3), (0.2, -0.1, 0.4), "warp"),
+    ],
 )
-def test_no_axis_that_jams_anywhere_exceeds_its_bound_and_the_bound_is_near(shift, turn_deg) -> None:
+def test_no_axis_that_jams_anywhere_exceeds_its_bound_and_the_bound_is_near(shift, turn_deg, limit) -> None:
     positioners = rc1(crooked_axes(3, scale=0.0))
     plan = moved(positioners, shift, turn_deg)
     assert plan.bounds is not None
-    worst = np.zeros((12, 2))
+    worst = np.zeros((12, 3))
     for at in np.linspace(0.05, 0.95, 13):
         for k in range(12):
             worst[k] = np.maximum(worst[k], jammed(positioners, plan, k, float(at * plan.duration_s)))
@@ -73,14 +81,19 @@ def test_no_axis_that_jams_anywhere_exceeds_its_bound_and_the_bound_is_near(shif
     fastest = int(np.argmax(plan.bounds.jam_n))
     assert plan.bounds.jam_n[fastest] <= 1.1 * worst[fastest, 1]
     assert plan.bounds.jam_mm[fastest] <= 1.1 * worst[fastest, 0]
-    assert "jammed: internal force" in plan.speed_limited_by
+    assert np.all(worst[:, 2] <= plan.bounds.jam_warp_n * 1.01 + 1.0)
+    assert f"jammed: {limit}" in plan.speed_limited_by
     assert plan.bounds.jam_n.max() <= 1500.0
+    assert plan.bounds.jam_warp_n.max() <= 300.0
+    if limit == "warp":
+        twisted = int(np.argmax(plan.bounds.jam_warp_n))
+        assert 300.0 * 0.99 <= plan.bounds.jam_warp_n[twisted] <= 1.1 * worst[twisted, 2]
 
 
 def test_the_permitted_speed_is_the_formulas() -> None:
     """c (stuck + v r + v^2 / 2a) = F: c = 13.9 kN/mm in X of RC-1, a = 200, r = 22 ms."""
     plan = moved(rc1(), (-100, 0, 0), (0, 0, 0))
-    bound = jam_bound(rc1(), np.zeros(12), GUARDED.jam)
+    bound = jam_bound(rc1(), np.zeros(12), GUARDED.jam, UP)
     assert bound.residual_per_mm[:3] == pytest.approx([0.69, 0.58, 0.25], abs=0.01)
     assert bound.force_per_mm[:3] == pytest.approx(STIFFNESS * bound.residual_per_mm[:3], rel=1e-6)
     room = 1500.0 / bound.force_per_mm[0] - 0.02
@@ -125,10 +138,84 @@ def test_what_no_speed_can_keep_is_refused_with_what_would_fit() -> None:
 
 def test_an_axis_that_alone_holds_a_direction_strains_nothing() -> None:
     """RC-3: A.X alone drives X; when it jams the part stays behind unstrained. A vertical axis warps it as in RC-1."""
-    bound = jam_bound(rc3(), np.zeros(12), GUARDED.jam)
+    bound = jam_bound(rc3(), np.zeros(12), GUARDED.jam, UP)
     driven = rc3().driven
     assert bound.force_per_mm[0] < 1.0
     assert bound.residual_per_mm[0] < 1e-4
     np.testing.assert_array_equal(bound.force_per_mm[~driven], 0.0)
     np.testing.assert_allclose(bound.residual_per_mm[~driven], 0.0, atol=1e-12)
     assert bound.force_per_mm[2] == pytest.approx(5000.0, rel=1e-3)
+
+
+HELD_N, TOLERANCE_N = 13400.0, 268.0
+D_Z = 11
+
+
+def with_held_force() -> Positioners:
+    """RC-3 whose D.Z holds its force."""
+    only = np.eye(12)[D_Z]
+    return replace(rc3(d_z_driven=False), held_n=HELD_N * only, held_tolerance_n=TOLERANCE_N * only)
+
+
+def raised(mm: float, jam: JamSettings) -> Plan:
+    asked = PlanRequest(1, "s", "k", np.zeros(12), Correction(FACE, np.zeros(3), np.array([0.0, 0.0, mm])), 10.0, 0.01,
+                        False)  # fmt: skip
+    return make_plan(asked, with_held_force(), replace(GUARDED, jam=jam))
+
+
+def test_a_held_force_that_jams_holds_a_position_as_a_driven_axis_does() -> None:
+    """The six others drive the part statically determinate: alone they strain nothing."""
+    held, driven = (jam_bound(p, np.zeros(12), GUARDED.jam, UP) for p in (with_held_force(), rc3()))
+    assert held.force_per_mm[D_Z] == pytest.approx(5000.0, rel=1e-3)
+    for cost in ("residual_per_mm", "force_per_mm", "warp_per_mm"):
+        assert getattr(held, cost)[D_Z] == pytest.approx(getattr(driven, cost)[D_Z], rel=1e-9)
+    np.testing.assert_allclose(np.delete(held.force_per_mm, D_Z), 0.0, atol=1.0)
+    assert held.tolerance_mm[D_Z] == pytest.approx(TOLERANCE_N / 5000.0, rel=1e-3)
+    assert np.isnan(np.delete(held.tolerance_mm, D_Z)).all()
+
+
+@pytest.mark.parametrize("v", [0.3, 0.99, 1.5, 3.0, 8.0])
+def test_its_jam_is_seen_by_its_load_cell_or_by_the_window_of_its_encoder(v: float) -> None:
+    """Load cell: 0.0536 mm, then two readings of 0.1 s; encoder: five read-backs, from 0.05 mm in them on."""
+    after_s = 0.022 + 0.5 * v / 200.0
+    slow = min(v, 1.0)
+    by_hand = max(0.0536 + slow * (0.2 + after_s), v * (0.05 + after_s))
+    reach = jam_bound(with_held_force(), np.zeros(12), GUARDED.jam, UP).reach_mm(np.full(12, v))
+    assert reach[D_Z] == pytest.approx(by_hand, rel=1e-3)
+    assert reach[2] == pytest.approx(0.02 + v * after_s)
+
+
+def test_the_speed_of_a_part_on_a_held_force_is_the_formulas() -> None:
+    """5 kN/mm x (v 72 ms + v^2 / 2 a) = 1500 N, a = 200: 3.7 mm/s. The others would let it run at 10 mm/s."""
+    plan = raised(60.0, JamSettings())
+    assert plan.bounds is not None
+    v = 200.0 * (-0.072 + np.sqrt(0.072**2 + 2.0 * 0.3 / 200.0))
+    assert plan.bounds.peak_mm_s[D_Z] == pytest.approx(v, rel=0.01)
+    assert plan.speed_limited_by == "D.Z jammed: internal force"
+    assert plan.bounds.jam_n[D_Z] == pytest.approx(1500.0, rel=0.01)
+    assert plan.bounds.jam_n[D_Z] <= 1500.0
+
+
+def test_a_tighter_limit_is_met_by_what_the_load_cell_shows_in_time() -> None:
+    """0.0536 + u 222 ms + u^2 / 2 a = 0.2 mm."""
+    plan = raised(60.0, JamSettings(force_n=1000.0))
+    assert plan.bounds is not None
+    u = 200.0 * (-0.222 + np.sqrt(0.222**2 + 2.0 * (0.2 - TOLERANCE_N / 5000.0) / 200.0))
+    assert plan.bounds.peak_mm_s[D_Z] == pytest.approx(u, rel=0.02)
+    assert plan.bounds.jam_n[D_Z] <= 1000.0
+
+
+def test_a_tolerance_over_the_limit_fits_no_speed() -> None:
+    with pytest.raises(StrainForeseen, match=r"D\.Z jammed: internal force") as refusal:
+        raised(5.0, JamSettings(force_n=250.0))
+    assert "out of tolerance" in refusal.value.cause
+
+
+def test_the_vertical_speed_is_bounded_by_warp() -> None:
+    """5 kN/mm x (0.02 + v 22 ms + v^2 / 2 a) = 300 N, a = 200: 1.55 mm/s where the force alone would let 8 mm/s."""
+    plan = moved(rc1(), (0, 0, 40), (0, 0, 0))
+    v = 200.0 * (-0.022 + np.sqrt(0.022**2 + 2.0 * 0.04 / 200.0))
+    assert plan.bounds is not None
+    assert plan.bounds.peak_mm_s[2] == pytest.approx(v, rel=0.01)
+    assert plan.bounds.jam_warp_n.max() == pytest.approx(300.0, rel=0.01)
+    assert plan.speed_limited_by.endswith("jammed: warp")

@@ -19,7 +19,7 @@ from tests.reference_geometry import FACE, SETTINGS, rc1
 def test_stretches_of_the_quintic_are_the_formula() -> None:
     """T = max(1.875 g / v, sqrt(5.7735 g / a), cbrt(60 g / j)) for a straight move of g mm."""
     path = rigid_path(rc1(), np.zeros(12), Correction(FACE, np.zeros(3), np.array([-100.0, 0.0, 0.0])))
-    jam = jam_bound(rc1(), np.zeros(12), SETTINGS.jam)
+    jam = jam_bound(rc1(), np.zeros(12), SETTINGS.jam, SETTINGS.load.up)
     limits = PaceLimits(rc1(), 4.0, 0.01, False, replace(SETTINGS, start_skew_s=0.01, sync_error_mm=0.02), jam)
     found = {name: factor for factor, name in limits.stretches(path, quintic()) if "jammed" not in name}
     assert found == {
@@ -60,7 +60,7 @@ def test_a_quarter_turn_stays_inside_its_limits_and_uses_them(
 def test_motion_along_a_turn_is_what_the_table_does() -> None:
     turn = Correction(np.zeros(3), np.radians([10.0, -20.0, 60.0]), np.array([500.0, 0.0, 0.0]))
     path = rigid_path(rc1(), np.zeros(12), turn)
-    limits = PaceLimits(rc1(), 50.0, 0.01, False, SETTINGS, jam_bound(rc1(), np.zeros(12), SETTINGS.jam))
+    limits = PaceLimits(rc1(), 50.0, 0.01, False, SETTINGS, jam_bound(rc1(), np.zeros(12), SETTINGS.jam, SETTINGS.load.up))
     for law in (quintic(20.0), fastest_law(path, limits)[0]):
         motion = motion_along(path, law)
         step = 0.004
