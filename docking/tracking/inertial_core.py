@@ -1,0 +1,182 @@
+"""The error-state Kalman filter of an inertial navigation: prediction in blocks, measurements by few columns.
+
+Error state, mm, s, rad: position p, velocity v of the sensor's origin in W, attitude phi in W (true = Exp(phi) C),
+force bias b_a (mm/s^2) and rate bias b_g in I: 15; behind them, as asked for, the time by which the sensor's stamps are
+late (1), a scale of the gyroscope (3), a lever arm (3). Between samples, with a = C f:
+
+    p' = v    v' = -[a]x phi - C b_a    phi' = -C b_g + C diag(w) s_g
+
+The covariance is carried over several samples at once with the sums of a and C over them; closed forms, no matrix
+exponential.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from docking.tracking.strapdown import G_W_MM_S2, orthonormal, turn
+from docking.tracking.types import MM_PER_M, InertialModel
+from docking.types import Array
+
+P, V, PHI, BA, BG = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
+BASE = 15
+_EYE3 = np.eye(3)
+
+
+class Extras(NamedTuple):
+    """States beyond the fifteen and their sd at the start; 0 leaves one out: `time_sd_s`, `scale_sd` (ratio),
+    `lever_sd_mm`."""
+
+    time_sd_s: float = 0.0
+    scale_sd: float = 0.0
+    lever_sd_mm: float = 0.0
+
+
+class Layout:
+    """Where the extra states lie in the error state; None where they are left out."""
+
+    def __init__(self, extras: Extras) -> None:
+        self.size = BASE
+        self.time = self._take(1, extras.time_sd_s)
+        self.scale = self._take(3, extras.scale_sd)
+        self.lever = self._take(3, extras.lever_sd_mm)
+
+    def _take(self, count: int, sd: float) -> slice | None:
+        if not sd > 0.0:
+            return None
+        self.size += count
+        return slice(self.size - count, self.size)
+
+
+class Navigation(NamedTuple):
+    """Nominal state at `t_s`: `p_mm`, `v_mm_s` (3,) of the sensor in W, `C_WI` (3, 3), biases, and the extra states."""
+
+    t_s: float
+    p_mm: Array
+    v_mm_s: Array
+    C_WI: Array
+    force_bias_mm_s2: Array
+    rate_bias: Array
+    late_s: float
+    scale: Array
+    lever_mm: Array
+
+    def moved(self, dx: Array, layout: Layout) -> Navigation:
+        """The state with the error `dx` (n,) taken in."""
+        x, y, z = dx[PHI].tolist()
+        return Navigation(
+            self.t_s,
+            self.p_mm + dx[P],
+            self.v_mm_s + dx[V],
+            turn(x, y, z) @ self.C_WI,
+            self.force_bias_mm_s2 + dx[BA],
+            self.rate_bias + dx[BG],
+            self.late_s + (float(dx[layout.time][0]) if layout.time else 0.0),
+            self.scale + dx[layout.scale] if layout.scale else self.scale,
+            self.lever_mm + dx[layout.lever] if layout.lever else self.lever_mm,
+        )
+
+
+class Since(NamedTuple):
+    """Sums over the samples since the covariance was last carried on: duration, velocity gained by specific force,
+    the way that it brought, and the angle turned, in I."""
+
+    dt_s: float
+    dv_mm_s: Array
+    ds_mm: Array
+    angle_rad: Array
+
+
+NOTHING = Since(0.0, np.zeros(3), np.zeros(3), np.zeros(3))
+
+
+def integrate(nav: Navigation, since: Since, t_s: float, force: Array, rate: Array) -> tuple[Navigation, Since]:
+    """Advance to `t_s` with the interval's mean specific force (mm/s^2) and rate (rad/s), both as measured."""
+    dt = t_s - nav.t_s
+    angle = ((rate - nav.rate_bias) * dt) * (1.0 + nav.scale)
+    x, y, z = angle.tolist()
+    after = nav.C_WI @ turn(x, y, z)
+    dv = ((0.5 * dt) * (nav.C_WI + after)) @ (force - nav.force_bias_mm_s2)
+    gained = dv + G_W_MM_S2 * dt
+    moved = nav._replace(
+        t_s=t_s, p_mm=nav.p_mm + (nav.v_mm_s + 0.5 * gained) * dt, v_mm_s=nav.v_mm_s + gained, C_WI=after
+    )
+    ds = since.ds_mm + (since.dv_mm_s + 0.5 * dv) * dt
+    return moved, Since(since.dt_s + dt, since.dv_mm_s + dv, ds, since.angle_rad + angle)
+
+
+def squared(nav: Navigation) -> Navigation:
+    """The state with its attitude made orthonormal again."""
+    return nav._replace(C_WI=orthonormal(nav.C_WI))
+
+
+def _skew(v: Array) -> Array:
+    x, y, z = v.tolist()
+    return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+
+
+class Propagation:
+    """Carries the covariance over the sums of several samples; the noise is the sensor's."""
+
+    def __init__(self, model: InertialModel, layout: Layout) -> None:
+        self._layout = layout
+        self._force, self._rate = (model.force_density * MM_PER_M) ** 2, model.rate_density**2
+        self._force_walk, self._rate_walk = (model.force_walk * MM_PER_M) ** 2, model.rate_walk**2
+        self._i3 = np.arange(3)
+
+    def __call__(self, cov: Array, C_before: Array, C_after: Array, since: Since) -> tuple[Array, Array]:
+        """(Phi, Phi P Phi^T + Q), both (n, n)."""
+        dt = since.dt_s
+        phi = np.eye(self._layout.size)
+        C = 0.5 * (C_before + C_after)
+        slope, way = _skew(since.dv_mm_s), _skew(since.ds_mm)
+        phi[P, V] = dt * _EYE3
+        phi[P, PHI], phi[V, PHI] = -way, -slope
+        phi[P, BA], phi[V, BA] = (-0.5 * dt * dt) * C, -dt * C
+        phi[PHI, BG] = -dt * C
+        # phi grows by -C b_g t meanwhile, so half of it has acted on the velocity, a third of that on the way
+        phi[V, BG], phi[P, BG] = (0.5 * dt) * (slope @ C), (dt / 3.0) * (way @ C)
+        if self._layout.scale is not None:
+            phi[PHI, self._layout.scale] = C * since.angle_rad
+        after = phi @ cov @ phi.T
+        self._add_noise(after, dt)
+        return phi, after
+
+    def _add_noise(self, cov: Array, dt: float) -> None:
+        i, v, a = self._i3, self._i3 + 3, self._force
+        cov[i, i] += a * dt**3 / 3.0
+        cov[i, v] += a * dt * dt / 2.0
+        cov[v, i] += a * dt * dt / 2.0
+        cov[v, v] += a * dt
+        cov[i + 6, i + 6] += self._rate * dt
+        cov[i + 9, i + 9] += self._force_walk * dt
+        cov[i + 12, i + 12] += self._rate_walk * dt
+
+
+def point_rows(nav: Navigation, layout: Layout, arms_W_mm: Array, turning_W: Array) -> Array:
+    """H (3k, n) of points at the arms `C l` (k, 3) from the sensor: z = p + C l. A sensor whose stamps are late by dt
+    was, when the image was taken, further on by the velocity of the point times dt."""
+    k = len(arms_W_mm)
+    h = np.zeros((k, 3, layout.size))
+    i = np.arange(3)
+    h[:, i, i] = 1.0
+    x, y, z = arms_W_mm.T
+    h[:, 0, 7], h[:, 0, 8] = z, -y
+    h[:, 1, 6], h[:, 1, 8] = -z, x
+    h[:, 2, 6], h[:, 2, 7] = y, -x
+    if layout.time is not None:
+        h[:, :, layout.time.start] = nav.v_mm_s + np.cross(turning_W, arms_W_mm)
+    if layout.lever is not None:
+        h[:, :, layout.lever] = nav.C_WI
+    return h.reshape(3 * k, layout.size)
+
+
+def taken_in(cov: Array, rows: Array, residual: Array, noise: Array) -> tuple[Array, Array]:
+    """One Kalman update: (dx (n,), covariance after). `rows` (m, n), `residual` (m,), `noise` (m, m)."""
+    ph = cov @ rows.T
+    s = rows @ ph + noise
+    gain = np.linalg.solve(s, ph.T).T
+    after = cov - gain @ ph.T
+    return gain @ residual, 0.5 * (after + after.T)

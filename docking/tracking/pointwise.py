@@ -1,0 +1,196 @@
+"""What the filters that follow every point by itself have in common: times, attitude, the body made of the points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from docking.errors import AttitudeUnknown, BadArgument, DockingError, TooFewPoints
+from docking.geometry import log_so3
+from docking.tracking.axis_filters import Mask
+from docking.tracking.body import BodyPose, body_pose, described
+from docking.tracking.faults import Alarms, InertialWatch, WatchSettings
+from docking.tracking.strapdown import G_W_MM_S2, Integral, Strapdown
+from docking.tracking.types import BodyModel, InertialModel, Start, TrackedState
+from docking.tracking.zero_velocity import RestDetector, ZeroVelocity
+from docking.types import Array, Pose
+
+FOR_A_POSE = 3
+ATTITUDE_GAIN = 0.05
+"""Share of the attitude that the seen points show which is taken over with every frame; the gyroscope does the rest."""
+SURE_REST_S = 1.0
+"""Quiet for so long is rest; an even slow turn may be as quiet for a moment and would be taken for bias."""
+LEVEL_S, REST_LEVEL_GAIN = 60.0, 0.2
+"""Where too few points show the attitude: time in which the mean specific force levels it, and the share of the tilt
+that one window of rest takes away."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame in the body's order: `xyz_mm` (n, 3) and `var_mm2` (n, 3) of every axis, meaningful where `seen` (n,)."""
+
+    t_s: float
+    xyz_mm: Array
+    var_mm2: Array
+    seen: Mask
+
+
+class PointwiseTracker:
+    """Base of the decoupled and coupled forms: subclasses say what begins, what a frame does and where the points are.
+
+    Frames must come in order; one that is older than the newest used is dropped and counted.
+    """
+
+    method = ""
+
+    def __init__(self, body: BodyModel, model: InertialModel, start: Start | None = None) -> None:
+        self.body, self._model, self._start = body, model, start
+        self._index = {name: i for i, name in enumerate(body.names)}
+        self._alarms = Alarms()
+        self._watch = InertialWatch(model, WatchSettings(), self._alarms, f"{body.name} inertial sensor")
+        self._strapdown: Strapdown | None = None
+        self._levelled: Integral | None = None
+        self._rest, self._quiet_s = RestDetector(ZeroVelocity()), float("inf")
+        self._frame_s = float("nan")
+        self._used_s = float("nan")
+        self._seen = np.zeros(len(body.names), dtype=bool)
+        self.dropped = 0
+        if start is not None:
+            self._strapdown = Strapdown(start.R_WB @ body.X_BI.R)
+
+    # what subclasses do ----------------------------------------------------------------------------------------------
+    def _begin(self, frame: Frame, ins: Integral) -> None:
+        raise NotImplementedError
+
+    def _step(self, frame: Frame, ins: Integral) -> None:
+        raise NotImplementedError
+
+    def _points_at(self, t_s: float, ins: Integral) -> tuple[Array, Array, Array]:
+        """Points (n, 3), their covariances (n, 3, 3) and the mean velocity (3,) at `t_s`."""
+        raise NotImplementedError
+
+    # what arrives ----------------------------------------------------------------------------------------------------
+    def imu(self, t_s: float, force_m_s2: Array, rate_rad_s: Array) -> None:
+        """One sample; see `Tracker.imu`. One that is not believed leaves a hole that the next interval bridges."""
+        good = self._watch.good(t_s, force_m_s2, rate_rad_s)
+        if self._strapdown is None or not good or t_s <= self._strapdown.t_s:
+            return
+        self._strapdown.sample(t_s, force_m_s2, rate_rad_s)
+        quiet = self._rest.sample(t_s, force_m_s2, rate_rad_s)
+        if quiet is False or self._quiet_s > t_s:
+            self._quiet_s = t_s
+        if quiet and t_s - self._quiet_s >= SURE_REST_S:
+            self._strapdown.rate_bias = self._rest.rate_rad_s
+            self._upright(self._strapdown.C_WI @ self._rest.force_m_s2, REST_LEVEL_GAIN)
+
+    def _upright(self, force_W: Array, gain: float) -> None:
+        """Turn the attitude so that a share `gain` of the angle between the specific force and the vertical goes."""
+        assert self._strapdown is not None
+        x, y, z = force_W.tolist()
+        self._strapdown.correct(np.array([gain * y / z, -gain * x / z, 0.0]))
+
+    def points(self, t_s: float, names: tuple[str, ...], xyz_W_mm: Array, cov_mm2: Array) -> None:
+        """One frame; see `Tracker.points`."""
+        frame = self._framed(t_s, names, xyz_W_mm, cov_mm2)
+        if self._strapdown is None:
+            self._strapdown = Strapdown(self._first_attitude(frame) @ self.body.X_BI.R)
+        ins = self._strapdown.at(t_s)
+        if ins is None or (t_s <= self._frame_s):
+            self.dropped += 1
+            return
+        if np.isnan(self._frame_s):
+            if not frame.seen.any():
+                return
+            self._begin(frame, ins)
+        else:
+            self._step(frame, ins)
+        self._frame_s, self._seen = t_s, frame.seen
+        if frame.seen.any():
+            self._used_s = t_s
+        self._level(frame)
+
+    def encoders(self, t_s: float, X_WB: Pose) -> None:
+        """Not used by this method."""
+
+    def alarms(self) -> list[DockingError]:
+        """See `Tracker.alarms`."""
+        return self._alarms.taken()
+
+    def _framed(self, t_s: float, names: tuple[str, ...], xyz: Array, cov: Array) -> Frame:
+        n = len(self.body.names)
+        points, var, seen = np.zeros((n, 3)), np.ones((n, 3)), np.zeros(n, dtype=bool)
+        for k, name in enumerate(names):
+            if name not in self._index:
+                raise BadArgument(self.body.name, "no such point", value=name)
+            i = self._index[name]
+            points[i], var[i], seen[i] = xyz[k], np.diag(cov[k]), True
+        return Frame(t_s, points, var, seen)
+
+    def _first_attitude(self, frame: Frame) -> Array:
+        if int(frame.seen.sum()) < FOR_A_POSE:
+            raise AttitudeUnknown(self.body.name, f"the first frame has {int(frame.seen.sum())} points")
+        return self._fit(frame).X_WB.R
+
+    def _fit(self, frame: Frame) -> BodyPose:
+        cov = frame.var_mm2[:, :, None] * np.eye(3)
+        return body_pose(self.body, frame.xyz_mm, cov, rows=np.flatnonzero(frame.seen))
+
+    def _level(self, frame: Frame) -> None:
+        """Three seen points show the attitude, else the specific force in the long run: a part of it is taken over."""
+        assert self._strapdown is not None
+        now, before = self._strapdown.at(frame.t_s), self._levelled
+        self._levelled = now
+        if int(frame.seen.sum()) >= FOR_A_POSE:
+            C = self._fit(frame).X_WB.R @ self.body.X_BI.R
+            self._strapdown.correct(ATTITUDE_GAIN * log_so3(C @ self._strapdown.C_WI.T))
+        elif before is not None and now is not None:
+            dt = now.t_s - before.t_s
+            self._upright(now.v_mm_s - before.v_mm_s - G_W_MM_S2 * dt, dt / LEVEL_S)
+
+    def _arms_W(self, C_WI: Array) -> Array:
+        """Vectors (n, 3) in W from the inertial sensor to the points."""
+        result: Array = (self.body.points_B_mm - self.body.X_BI.t_mm) @ (C_WI @ self.body.X_BI.R.T).T
+        return result
+
+    def _start_points(self, frame: Frame) -> Array:
+        """All points (n, 3) at the first frame; those not seen by the pose of the others."""
+        if frame.seen.all():
+            return frame.xyz_mm
+        if int(frame.seen.sum()) < FOR_A_POSE:
+            raise TooFewPoints(self.body.name, value=int(frame.seen.sum()), limit=FOR_A_POSE)
+        return np.where(frame.seen[:, None], frame.xyz_mm, self._fit(frame).X_WB.apply(self.body.points_B_mm))
+
+    # what is asked ---------------------------------------------------------------------------------------------------
+    def state(self, t_s: float | None = None) -> TrackedState | None:
+        """See `Tracker.state`."""
+        if np.isnan(self._frame_s):
+            return None
+        assert self._strapdown is not None
+        t = max(self._frame_s, self._strapdown.t_s) if t_s is None else t_s
+        ins = self._strapdown.at(t)
+        assert ins is not None
+        points, cov, velocity = self._points_at(t, ins)
+        return self._described(t, points, cov, velocity, ins.C_WI @ self.body.X_BI.R.T)
+
+    def _described(self, t_s: float, points: Array, cov: Array, velocity: Array, R_WB: Array) -> TrackedState:
+        body = self.body
+        if len(points) >= FOR_A_POSE:
+            pose = body_pose(body, points, cov)
+        else:
+            arms = body.points_B_mm @ R_WB.T
+            pose = described(*_shifted(R_WB, points - arms, body.com_B_mm, cov))
+        worst = float(np.sqrt(np.trace(cov, axis1=1, axis2=2).max()))
+        source = "image" if self._seen.any() else "inertial"
+        return TrackedState(
+            t_s, pose.X_WB, velocity, pose.cov, pose.com_W_mm, points, cov, self._seen, pose.attitude_rad,
+            pose.attitude_sd_rad, t_s - self._used_s, source, worst,
+        )  # fmt: skip
+
+
+def _shifted(R_WB: Array, origins_mm: Array, com_B_mm: Array, cov_mm2: Array) -> tuple[Pose, Array, Array]:
+    """Pose, centre of mass and covariance where too few points give a turn: NaN there."""
+    X = Pose(R_WB, origins_mm.mean(axis=0))
+    cov = np.full((6, 6), np.nan)
+    cov[3:, 3:] = cov_mm2.mean(axis=0) / len(cov_mm2)
+    return X, X.apply(com_B_mm), cov

@@ -1,0 +1,80 @@
+"""The repaired decoupled pair: filter 1 of [Zhao] with the errors of the INS channel as states, fed back at once.
+
+States a point and axis in W: error of the INS position and velocity and the bias, [dp, dv, b]. Printed filter 1 books
+an error of the start velocity as bias; here it has a state of its own. The INS channel is corrected after every update,
+so that t counts from the last image and errors stay small.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from docking.tracking.axis_filters import ThreeStateFilters, drift_noise
+from docking.tracking.pointwise import Frame, PointwiseTracker
+from docking.tracking.strapdown import Integral
+from docking.tracking.types import MM_PER_M, BodyModel, InertialModel, Start
+from docking.types import Array
+
+
+@dataclass(frozen=True)
+class RepairedSettings:
+    """`bias_density` mm^2/s^5: the bias in W walks, as it turns with the body and stands for its tilt error too."""
+
+    bias_density: float = 100.0
+    velocity_sd_mm_s: float = 100.0
+    bias_sd_mm_s2: float = 200.0
+
+
+class RepairedTracker(PointwiseTracker):
+    """Decoupled pair with feedback for every point and axis."""
+
+    method = "repaired"
+
+    def __init__(
+        self,
+        body: BodyModel,
+        model: InertialModel,
+        start: Start | None = None,
+        settings: RepairedSettings | None = None,
+    ) -> None:
+        super().__init__(body, model, start)
+        self._s = settings or RepairedSettings()
+
+    def _begin(self, frame: Frame, ins: Integral) -> None:
+        self._at, self._arms = ins, self._arms_W(ins.C_WI)
+        self._p_mm = self._start_points(frame)
+        self._v_mm_s, self._b_mm_s2 = np.zeros_like(self._p_mm), np.zeros_like(self._p_mm)
+        cov = np.diag([float(frame.var_mm2.max()), self._s.velocity_sd_mm_s**2, self._s.bias_sd_mm_s2**2])
+        density = self._model.force_density * MM_PER_M
+        walk = self._s.bias_density
+        self._errors = ThreeStateFilters(np.zeros((3, self._p_mm.size)), cov, lambda dt: drift_noise(dt, density, walk))
+
+    def _carried(self, ins: Integral) -> tuple[Array, Array, Array]:
+        """INS positions, velocities (n, 3) and arms at `ins`, the bias taken off."""
+        a = self._at
+        dt = ins.t_s - a.t_s
+        arms = self._arms_W(ins.C_WI)
+        way = ins.s_mm - a.s_mm - a.v_mm_s * dt
+        p = self._p_mm + self._v_mm_s * dt + way - (0.5 * dt * dt) * self._b_mm_s2 + arms - self._arms
+        return p, self._v_mm_s + (ins.v_mm_s - a.v_mm_s) - dt * self._b_mm_s2, arms
+
+    def _step(self, frame: Frame, ins: Integral) -> None:
+        dt = frame.t_s - self._frame_s
+        self._p_mm, self._v_mm_s, self._arms = self._carried(ins)
+        self._at = ins
+        self._errors.predict(dt)
+        seen = np.repeat(frame.seen, 3)
+        self._errors.update((self._p_mm - frame.xyz_mm).ravel(), frame.var_mm2.ravel(), seen)
+        dp, dv, db = self._errors.x.reshape(3, -1, 3)
+        self._p_mm, self._v_mm_s, self._b_mm_s2 = self._p_mm - dp, self._v_mm_s - dv, self._b_mm_s2 + db
+        self._errors.x = np.zeros_like(self._errors.x)
+
+    def _points_at(self, t_s: float, ins: Integral) -> tuple[Array, Array, Array]:
+        points, velocity, _ = self._carried(ins)
+        ahead = self._errors.copy()
+        if t_s > self._frame_s:
+            ahead.predict(t_s - self._frame_s)
+        cov = ahead.p[0].reshape(-1, 3)[:, :, None] * np.eye(3)
+        return points, cov, velocity.mean(axis=0)
