@@ -15,6 +15,7 @@ from docking.geometry import matrix_to_euler, skew
 from docking.point_file import read_points, read_weights
 from docking.pose import fit_pose, screen
 from docking.pose.locks import turning_axes
+from docking.pose.passes import lost_beam
 from docking.pose.quantiles import chi2_tail
 from docking.types import Array, Fit, Points, Pose, Rejection, Screened
 
@@ -63,13 +64,20 @@ def run_fit(nominal_path: str | Path, measured_path: str | Path, options: FitOpt
     written = {**read_weights(Path(nominal_path)), **read_weights(Path(measured_path))}
     settings = settings_from(options, nominal, measured, written)
     nominal, measured = prepared(options, nominal, measured)
-    known = bool(np.all(np.isfinite(nominal.cov_mm2)) and np.all(np.isfinite(measured.cov_mm2)))
+    known = bool(np.all(np.isfinite(nominal.cov_mm2))) and _noise_known(measured)
     given = expansion_from(options.temperature)
     try:
         screened = screen(nominal, measured, settings)
         return FitResult(nominal, fit_pose(screened, settings), screened, None, given, known)
     except PoseError as refusal:
         return FitResult(nominal, None, None, refusal, given, known)
+
+
+def _noise_known(points: Points) -> bool:
+    """Whether every reading that can be used has a covariance: a lost beam needs none."""
+    return all(
+        lost_beam(xyz) or bool(np.all(np.isfinite(cov))) for xyz, cov in zip(points.xyz_mm, points.cov_mm2, strict=True)
+    )
 
 
 def fit_files(nominal_path: str | Path, measured_path: str | Path, method: str = "ml") -> dict[str, Any]:

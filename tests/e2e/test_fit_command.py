@@ -94,6 +94,14 @@ def test_without_sigmas_chi_square_proves_nothing(fitted: Fitted) -> None:
     assert told["sigma"]["x_mm"] > 0.0
 
 
+def test_a_lost_beam_takes_nothing_from_the_judgement(fitted: Fitted) -> None:
+    p = seen()
+    p[6] = 0.0
+    told = fitted(p, *TRACKER)[1]
+    assert {r["name"]: r["reason"] for r in told["rejected"]} == {"T7": "lost-beam"}
+    assert 0.001 < told["chi2_p"] < 0.999
+
+
 @pytest.mark.parametrize("method", ["svd", "least-squares", "three-point"])
 def test_the_other_methods_carry_a_covariance_too(fitted: Fitted, method: str) -> None:
     told = fitted(seen(), *TRACKER, "--method", method)[1]
