@@ -108,7 +108,8 @@ class _Solver:
         self.pixels = np.ascontiguousarray(bundle.pixels[self.order].T)
         self.inverse_sigma = 1.0 / bundle.sigma_px[self.order]
         self.robust_at = bundle.robust_at[self.order]
-        self.free = np.flatnonzero(~bundle.held_frames)
+        observed = np.bincount(self.frames, minlength=len(bundle.R)) > 0
+        self.free = np.flatnonzero(~bundle.held_frames & observed)
         self.slot = np.full(len(bundle.R), -1)
         self.slot[self.free] = np.arange(len(self.free))
         self.moving = np.flatnonzero(self.slot[self.frames] >= 0)
@@ -124,6 +125,11 @@ class _Solver:
         counts = np.bincount(slots, minlength=len(self.free))
         self.row_ends = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
         self.block_columns = self.columns[self.by_frame].astype(np.int32)
+
+    def sum_by_frame(self, values: Array) -> Array:
+        """Sums (n,) over the observations of every free camera; `values` in the order of `by_frame`."""
+        sums: Array = np.add.reduceat(values, self.row_ends[:-1]) if len(self.free) else np.zeros(0)
+        return sums
 
     def run(self, iterations: int, tolerance: float) -> Adjusted:
         bundle = self.bundle
@@ -153,8 +159,7 @@ class _Solver:
 
     def _cost(self, state: _State) -> tuple[Array, float]:
         """(residuals (2, o) px, robust cost); points behind a camera make the cost infinite."""
-        local = state.points[self.seen[self.columns]]
-        projected, depth = project_rows(self.camera(state), state.R[self.frames], state.t[self.frames], local)
+        projected, depth = project_rows(self.camera(state), *self._gathered(state))
         residuals = self.pixels - projected
         if not (depth.min(initial=1.0) > 0.0):
             return residuals, np.inf
@@ -166,15 +171,20 @@ class _Solver:
             cost += float(np.sum((state.intrinsics / self.bundle.camera_sigma) ** 2))
         return residuals, cost
 
+    def _gathered(self, state: _State) -> tuple[Array, Array, Array]:
+        """Rotation (3, 3, o), translation (3, o) and point (3, o) of every observation."""
+        points = np.ascontiguousarray(state.points[self.seen].T)
+        R, t = np.ascontiguousarray(state.R.transpose(1, 2, 0)), np.ascontiguousarray(state.t.T)
+        return R.take(self.frames, axis=2), t.take(self.frames, axis=1), points.take(self.columns, axis=1)
+
     def prior_residuals(self, state: _State) -> Array:
         bundle = self.bundle
-        return (bundle.prior_points - state.points[bundle.prior_rows]) / bundle.prior_sigma
+        result: Array = (bundle.prior_points - state.points[bundle.prior_rows]) / bundle.prior_sigma
+        return result
 
     def linearised(self, state: _State) -> Linearised:
         """Jacobians and residuals, whitened and weighted."""
-        rows = linearise(
-            self.camera(state), state.R[self.frames], state.t[self.frames], state.points[self.seen[self.columns]]
-        )
+        rows = linearise(self.camera(state), *self._gathered(state))
         residuals = self.pixels - rows.projected
         size = np.hypot(*residuals) * self.inverse_sigma
         # Huber: beyond the limit the weight falls with 1/size.
@@ -205,23 +215,23 @@ class _Normal:
         size = 6 * n + q
         self.U, self.g = np.zeros((size, size)), np.zeros(size)
         self._points(rows, state)
-        moving, slots = solver.by_frame, solver.slot[solver.frames[solver.by_frame]]
-        frame, residual = rows.by_frame[:, :, moving], rows.residuals[:, moving]
+        moving = solver.by_frame
+        frame, residual = rows.by_frame.take(moving, axis=2), rows.residuals.take(moving, axis=1)
+        at = 6 * np.arange(n)
         for i in range(6):
-            self.g[i : 6 * n : 6] = np.bincount(slots, np.einsum("ao,ao->o", frame[:, i], residual), n)
+            self.g[at + i] = solver.sum_by_frame(frame[0, i] * residual[0] + frame[1, i] * residual[1])
             for j in range(i, 6):
-                sums = np.bincount(slots, frame[0, i] * frame[0, j] + frame[1, i] * frame[1, j], n)
-                at = 6 * np.arange(n)
+                sums = solver.sum_by_frame(frame[0, i] * frame[0, j] + frame[1, i] * frame[1, j])
                 self.U[at + i, at + j] = self.U[at + j, at + i] = sums
-        point = rows.by_point[:, :, moving]
+        point = rows.by_point.take(moving, axis=2)
         self.W = np.empty((6, 3, len(moving)))
         for i in range(6):
             for j in range(3):
                 self.W[i, j] = frame[0, i] * point[0, j] + frame[1, i] * point[1, j]
         self.W[:, :, solver.held[solver.columns[moving]]] = 0.0
-        self.W_bsr = self._blocks(self.W).transpose() if n else None
+        self.W_transposed = self._blocks(self.W).transpose()
         if q:
-            self._intrinsics(rows, state, slots, moving)
+            self._intrinsics(rows, state, frame)
 
     def _blocks(self, values: Array) -> bsr_array:
         solver = self.solver
@@ -234,7 +244,8 @@ class _Normal:
         self.V = np.empty((3, 3, len(solver.seen)))
         self.h = np.empty((3, len(solver.seen)))
         for i in range(3):
-            self.h[i] = np.add.reduceat(np.einsum("ao,ao->o", point[:, i], rows.residuals), solver.starts)
+            products = point[0, i] * rows.residuals[0] + point[1, i] * rows.residuals[1]
+            self.h[i] = np.add.reduceat(products, solver.starts)
             for j in range(i, 3):
                 products = point[0, i] * point[0, j] + point[1, i] * point[1, j]
                 self.V[i, j] = self.V[j, i] = np.add.reduceat(products, solver.starts)
@@ -244,7 +255,7 @@ class _Normal:
             np.add.at(self.h[i], solver.prior_slot, inverse[i] * solver.prior_residuals(state)[:, i])
         self.h[:, solver.held] = 0.0
 
-    def _intrinsics(self, rows: Linearised, state: _State, slots: NDArray[np.integer], moving: Array) -> None:
+    def _intrinsics(self, rows: Linearised, state: _State, frame: Array) -> None:
         solver, n = self.solver, len(self.solver.free)
         sigma = solver.bundle.camera_sigma
         assert sigma is not None
@@ -252,13 +263,13 @@ class _Normal:
         self.U[at:, at:] = np.einsum("aio,ajo->ij", camera, camera, optimize=True) + np.diag(sigma**-2)
         self.g[at:] = np.einsum("aio,ao->i", camera, rows.residuals) - state.intrinsics / sigma**2
         self.K = np.empty((INTRINSICS, 3, len(solver.seen)))
+        ordered = camera.take(solver.by_frame, axis=2)
         for k in range(INTRINSICS):
             for i in range(6):
-                products = np.einsum("ao,ao->o", camera[:, k, moving], rows.by_frame[:, i, moving])
-                sums = np.bincount(slots, products, n)
+                sums = solver.sum_by_frame(ordered[0, k] * frame[0, i] + ordered[1, k] * frame[1, i])
                 self.U[i:at:6, at + k] = self.U[at + k, i:at:6] = sums
             for j in range(3):
-                products = np.einsum("ao,ao->o", camera[:, k], rows.by_point[:, j])
+                products = camera[0, k] * rows.by_point[0, j] + camera[1, k] * rows.by_point[1, j]
                 self.K[k, j] = np.add.reduceat(products, solver.starts)
         self.K[:, :, solver.held] = 0.0
 
@@ -272,7 +283,7 @@ class _Normal:
         if n:
             chosen = inverse[:, :, solver.columns[solver.by_frame]]
             Y = self._blocks(_times(self.W, chosen))
-            S[:at, :at] -= (Y @ self.W_bsr).toarray()
+            S[:at, :at] -= (Y @ self.W_transposed).toarray()
             right[:at] -= Y @ self.h.T.ravel()
         if solver.intrinsics:
             KV = _times(self.K, inverse)
@@ -287,7 +298,7 @@ class _Normal:
             raise LinAlgError
         back = np.zeros_like(self.h)
         if n:
-            back += (self.W_bsr @ step[:at]).reshape(-1, 3).T
+            back += (self.W_transposed @ step[:at]).reshape(-1, 3).T
         if solver.intrinsics:
             back += np.einsum("kim,k->im", self.K, step[at:])
         points = Vh - np.einsum("ijm,jm->im", inverse, back)
@@ -311,4 +322,5 @@ def _inverse(V: Array, damping: float) -> Array:
     A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
     scale = 1.0 / (a * A + b * B + c * C)
     D, E, F = a * f - c * c, b * c - a * e, a * d - b * b
-    return np.array([[A, B, C], [B, D, E], [C, E, F]]) * scale
+    result: Array = np.array([[A, B, C], [B, D, E], [C, E, F]]) * scale
+    return result

@@ -44,7 +44,8 @@ def circle_conic(H: Array, centre_mm: Array, radius_mm: float) -> Array:
     r2 = radius_mm**2
     dual = np.array([[x * x - r2, x * y, x], [x * y, y * y - r2, y], [x, y, 1.0]])
     image: Array = H @ dual @ H.T
-    return image / image[2, 2]
+    image /= image[2, 2]
+    return image
 
 
 def ellipse_of(dual: Array) -> Ellipse:

@@ -40,17 +40,17 @@ def _distorted(camera: Camera, x: Array, y: Array) -> tuple[Array, Array, Array,
 
 
 def project_rows(camera: Camera, R: Array, t: Array, points: Array) -> tuple[Array, Array]:
-    """(pixels (2, o), depths (o,)) of points (o, 3), each in its own camera `R` (o, 3, 3), `t` (o, 3)."""
-    X, Y, Z = (np.einsum("oj,oj->o", R[:, i], points) + t[:, i] for i in range(3))
+    """(pixels (2, o), depths (o,)) of points (3, o), each in its own camera `R` (3, 3, o), `t` (3, o)."""
+    X, Y, Z = (R[i, 0] * points[0] + R[i, 1] * points[1] + R[i, 2] * points[2] + t[i] for i in range(3))
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v, _, _ = _distorted(camera, X / Z, Y / Z)
     return np.array([u * camera.fx_px + camera.cx_px, v * camera.fy_px + camera.cy_px]), Z
 
 
 def linearise(camera: Camera, R: Array, t: Array, points: Array) -> Linearised:
-    """Projections and their derivatives."""
-    turned = [np.einsum("oj,oj->o", R[:, i], points) for i in range(3)]
-    X, Y, Z = (turned[i] + t[:, i] for i in range(3))
+    """Projections and their derivatives; shapes as for `project_rows`."""
+    turned = [R[i, 0] * points[0] + R[i, 1] * points[1] + R[i, 2] * points[2] for i in range(3)]
+    X, Y, Z = (turned[i] + t[i] for i in range(3))
     w = 1.0 / Z
     x, y = X * w, Y * w
     u, v, radial, r2 = _distorted(camera, x, y)
@@ -61,8 +61,8 @@ def linearise(camera: Camera, R: Array, t: Array, points: Array) -> Linearised:
     dux = (radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x) * camera.fx_px
     dvy = (radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x) * camera.fy_px
     duy, dvx = cross * camera.fx_px, cross * camera.fy_px
-    by_frame = np.empty((2, 6, len(points)))
-    by_point = np.empty((2, 3, len(points)))
+    by_frame = np.empty((2, 6, points.shape[1]))
+    by_point = np.empty((2, 3, points.shape[1]))
     for a, (dx, dy) in enumerate(((dux, duy), (dvx, dvy))):
         row = (dx * w, dy * w, -(dx * x + dy * y) * w)
         for i in range(3):
@@ -70,7 +70,7 @@ def linearise(camera: Camera, R: Array, t: Array, points: Array) -> Linearised:
             # d(R p) = w x (R p): the row's product with the cross product is another cross product.
             by_frame[a, i] = turned[j] * row[k] - turned[k] * row[j]
             by_frame[a, 3 + i] = row[i]
-            by_point[a, i] = row[0] * R[:, 0, i] + row[1] * R[:, 1, i] + row[2] * R[:, 2, i]
+            by_point[a, i] = row[0] * R[0, i] + row[1] * R[1, i] + row[2] * R[2, i]
     zero, one = np.zeros_like(x), np.ones_like(x)
     fx, fy = camera.fx_px, camera.fy_px
     by_camera = np.array(
