@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 
 import numpy as np
@@ -128,6 +129,21 @@ def test_a_ball_whose_force_rises_stops_the_step(tmp_path):
     (moved,), (plan,) = case.bodies("moved"), case.bodies("plan")
     assert moved["result"] == "stopped"
     assert moved["path_time_s"] < plan["duration_s"]
+
+
+def test_a_ball_whose_force_rises_after_the_step_ends_it(tmp_path):
+    """The step is over and its guard with it when the load cell of a ball shows 900 N more: seen by the weighing."""
+
+    def push_later(case: ReliefCase) -> None:
+        asyncio.get_running_loop().call_later(1.2, case.far.plant.misread_force, "A.Z", 900.0)
+
+    strained = Strained("fuselage-can", 1, warp_mm("fuselage-can", "B.Z", 1500.0), while_moving=push_later)
+    case = relieved(strained, tmp_path / "r.jsonl")
+    assert case.state is State.FAULT
+    assert case.alarms() == [(2131, "ball A")]
+    (moved,), (plan,) = case.bodies("moved"), case.bodies("plan")
+    assert moved["result"] == "done"
+    assert plan["duration_s"] < 1.2
 
 
 def test_an_axis_that_does_not_give_ends_it(tmp_path):

@@ -1,4 +1,4 @@
-"""Every limit of the monitors is the cell file's own: none is swapped with another or scaled on its way."""
+"""Every limit of the monitors, and the lease, is the cell file's own: none is swapped with another or scaled."""
 
 from __future__ import annotations
 
@@ -6,9 +6,13 @@ from dataclasses import fields
 
 import pytest
 
+from docking.assemble.motion_side import lease_settings, service_settings
+from docking.config.build import LOAD_CELL_CYCLES
+from docking.config.cell import ModbusBus
 from docking.config.load import load_cell
 from docking.motion.monitors.build import watch_limits
 from docking.motion.monitors.limits import WatchLimits
+from drivers.maps.objects import load_object_map
 from tests.support.planned_moves import CELLS
 
 IN_THE_FILE = {
@@ -31,3 +35,20 @@ def test_each_limit_is_the_files(name: str) -> None:
     others = {field.name for field in fields(WatchLimits)} - {name}
     before, after = watch_limits(cell), watch_limits(changed)
     assert all(getattr(before, other) == getattr(after, other) for other in others)
+
+
+@pytest.mark.parametrize("name", ["lab-can", "lab-modbus"])
+def test_the_lease_and_the_limit_of_lateness_are_the_files(name: str) -> None:
+    cell = load_cell(CELLS / f"{name}.toml")
+    cell = cell.model_copy(update={"motion": cell.motion.model_copy(update={"lease_s": 0.3, "feedback_s": 0.07})})
+    served, owed = service_settings(cell), lease_settings(cell)
+    assert (served.lease_s, served.feedback_s) == (owed.lease_s, owed.feedback_s) == (0.3, 0.07)
+    if isinstance(cell.bus, ModbusBus):
+        assert served.late_limit_s == 0.5 * cell.bus.watchdog_s
+    else:
+        assert served.late_limit_s == cell.limits.tick_late_cycles * cell.bus.cycle_s
+        assert served.sync_error_mm == cell.limits.sync_error_mm
+
+
+def test_load_cells_report_as_often_as_the_planner_counts_on() -> None:
+    assert load_object_map("cia402").pdos["force"].transmission == LOAD_CELL_CYCLES
