@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from docking.errors import FileUnreadable
+from docking.guidance.features import grey
 from docking.guidance.opencv import opencv
 from docking.guidance.types import Image
 
@@ -22,33 +23,33 @@ class Picture(NamedTuple):
     image: Image
 
 
-def pictures(source: Path, fps: float = FOLDER_FPS) -> Iterator[Picture]:
+def pictures(source: Path, fps: float = FOLDER_FPS, *, colour: bool = False) -> Iterator[Picture]:
     """The images of a folder in the order of their names (`fps` gives their times), of one image file, or of a video.
 
-    Raises FileUnreadable, ExtraMissing.
+    Grey (h, w), or with `colour` BGR (h, w, 3). Raises FileUnreadable, ExtraMissing.
     """
     if source.is_dir():
         files = sorted(path for path in source.iterdir() if path.suffix.lower() in SUFFIXES)
         if not files:
             raise FileUnreadable(str(source), "no image in this folder")
         for i, path in enumerate(files):
-            yield Picture(path.name, i / fps, read_image(path))
+            yield Picture(path.name, i / fps, read_image(path, colour=colour))
     elif source.suffix.lower() in SUFFIXES:
-        yield Picture(source.name, 0.0, read_image(source))
+        yield Picture(source.name, 0.0, read_image(source, colour=colour))
     else:
-        yield from _video(source)
+        yield from _video(source, colour=colour)
 
 
-def read_image(path: Path) -> Image:
-    """A grey image file. Raises FileUnreadable."""
+def read_image(path: Path, *, colour: bool = False) -> Image:
+    """An image file, grey or BGR. Raises FileUnreadable."""
     cv2 = opencv()
-    image: Image | None = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    image: Image | None = cv2.imread(str(path), cv2.IMREAD_COLOR if colour else cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise FileUnreadable(str(path), "not an image that OpenCV can read")
     return image
 
 
-def _video(path: Path) -> Iterator[Picture]:
+def _video(path: Path, *, colour: bool) -> Iterator[Picture]:
     cv2 = opencv()
     capture = cv2.VideoCapture(str(path))
     try:
@@ -58,7 +59,7 @@ def _video(path: Path) -> Iterator[Picture]:
             there, image = capture.read()
             if not there:
                 break
-            yield Picture(f"{path.stem}-{number:05d}", number / fps, cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+            yield Picture(f"{path.stem}-{number:05d}", number / fps, image if colour else grey(image))
             number += 1
         if number == 0:
             raise FileUnreadable(str(path), "not a video that OpenCV can read")
