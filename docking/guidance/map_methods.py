@@ -14,9 +14,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from docking.errors import MarkersTooFew, NotLocalised
+from docking.errors import BadArgument, MarkersTooFew, NotLocalised
 from docking.guidance.bundle import Bundle, adjust
-from docking.guidance.detection import SIGNS, MarkerSighting, hull_share, planar_poses
+from docking.guidance.detection import SIGNS, Gate, MarkerSighting, hull_share, planar_poses
 from docking.guidance.features import SCALE
 from docking.guidance.marker_survey import (
     Registered,
@@ -71,6 +71,18 @@ class MethodSettings:
     camera_sigma: tuple[float, ...] | None = CAMERA_SIGMA
     circle_sigma_px: float = CIRCLE_SIGMA_PX
     iterations: int = 10
+
+
+def method_settings(gate: str, hold_camera: bool = False) -> MethodSettings:
+    """Settings of a gate `MM,DEG,CIRCLES`. Raises BadArgument."""
+    try:
+        distance_mm, angle_deg, circles = (float(text) for text in gate.split(","))
+    except ValueError as error:
+        raise BadArgument("--gate", "three numbers MM,DEG,CIRCLES", value=gate) from error
+    if not (distance_mm > 0.0 and 0.0 < angle_deg <= 90.0 and circles in (1.0, 2.0, 3.0, 4.0)):
+        raise BadArgument("--gate", "a distance > 0, an angle up to 90 deg, 1 to 4 circles", value=gate)
+    rules = RegistrationSettings(gate=Gate(distance_mm, angle_deg, int(circles)))
+    return MethodSettings(rules, None if hold_camera else CAMERA_SIGMA)
 
 
 def published(free: ArMap, layout: MarkerLayout, sightings: Sightings, settings: MethodSettings) -> Placed:
