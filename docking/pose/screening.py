@@ -20,6 +20,7 @@ from docking.pose.pairs import check_units, distances, estimated_sigma_mm, estim
 from docking.pose.passes import Averaged, average_passes
 from docking.pose.quantiles import chi2_tail
 from docking.pose.reasons import Reasons, explain
+from docking.pose.relabel import relabelled
 from docking.pose.settings import FitSettings
 from docking.pose.snooping import Pairs, Tested, all_agree, residuals_mm, snoop
 from docking.pose.svd import fit_svd, mirrored_rms_mm
@@ -97,10 +98,22 @@ def _matched(nominal: Points, averaged: Averaged) -> Pairs:
 def _screen_pairs(pairs: Pairs, averaged: Averaged, settings: FitSettings) -> Screened:
     """Screen matched points; see `screen`."""
     if not (len(pairs.names) >= MIN_POINTS):
-        raise TooFewPoints(settings.where, _named(averaged.rejected), value=len(pairs.names), limit=MIN_POINTS)
+        cause = _named(averaged.rejected) or "no other point has a name that both sides know"
+        raise TooFewPoints(settings.where, cause, value=len(pairs.names), limit=MIN_POINTS)
     check_layout(pairs.nominal_mm, settings)
     check_units(pairs.nominal_mm, pairs.measured_mm, settings)
     graph = _consistency(pairs, settings)
+    try:
+        return _screen_graph(pairs, graph, averaged, settings)
+    except (NotCongruent, AmbiguousSet) as error:
+        mixed_up = _mixed_up(pairs, graph, settings)
+        if mixed_up is None:
+            raise
+        raise mixed_up from error
+
+
+def _screen_graph(pairs: Pairs, graph: _Graph, averaged: Averaged, settings: FitSettings) -> Screened:
+    """Screen points whose consistent pairs are known; see `screen`."""
     if not (len(graph.clique) >= min(settings.min_agreeing, MIN_POINTS)):
         raise _not_congruent(pairs, graph, settings)
     if len(graph.clique) < len(pairs.names):
@@ -204,6 +217,20 @@ def _not_congruent(pairs: Pairs, graph: _Graph, settings: FitSettings) -> NotCon
         Rejection(pairs.names[i], "inconsistent", f"its distances agree with {agreeing[i]} of {others} points")
         for i in accused
     )
+    return error
+
+
+def _mixed_up(pairs: Pairs, graph: _Graph, settings: FitSettings) -> NotCongruent | None:
+    """The refusal that names who was measured where, when the points fit under other labels; else None."""
+    X = relabelled(pairs, float(np.median(graph.tolerance_mm)))
+    if X is None:
+        return None
+    known = pairs if graph.sigma_mm is None else _with_sigma(pairs, graph.sigma_mm)
+    why = explain(known, X, list(range(len(pairs.names))), graph.tolerance_mm)
+    named = tuple(r for r in why.rejected if r.partner)
+    cause = f"the labels are mixed up: {len(named)} of {len(pairs.names)} points are where another should be"
+    error = NotCongruent(settings.where, cause, value=len(graph.clique), limit=settings.min_agreeing)
+    error.rejected = named
     return error
 
 

@@ -377,6 +377,35 @@ def test_all_labels_mixed_up_is_refused_or_harmless() -> None:
             scene.screen(FitSettings(min_agreeing=4))
 
 
+@pytest.mark.parametrize("sigma_mm", [NOISE_MM, UNKNOWN])
+@pytest.mark.parametrize("n", [6, 10, 20])
+def test_all_labels_mixed_up_are_named(n: int, sigma_mm: float) -> None:
+    """Names given from the other end: no pose, but every point is told where it was measured."""
+    scene = Scene(17, n, sigma_mm)
+    order = np.arange(n)[::-1]
+    scene.p = scene.p[order]
+    with pytest.raises(NotCongruent) as caught:
+        scene.screen()
+    assert "labels are mixed up" in caught.value.text()
+    assert {r.name: (r.reason, r.partner) for r in caught.value.rejected} == {
+        scene.names[i]: ("swapped", scene.names[order[i]]) for i in range(n)
+    }
+
+
+def test_labels_of_a_symmetric_layout_are_not_guessed() -> None:
+    """A box: many relabellings are congruent. And another part has none."""
+    corners = np.array([[x, y, z] for x in (0, 4000) for y in (0, 2000) for z in (0, 1000)], dtype=float)
+    names = [f"T{i}" for i in range(8)]
+    order = [3, 0, 5, 1, 7, 2, 4, 6]
+    with pytest.raises(PoseError) as caught:
+        screen(points(names, corners, 1e-3), points(names, corners[order], NOISE_MM))
+    assert "mixed up" not in caught.value.text()
+    rng = np.random.default_rng(3)
+    with pytest.raises(PoseError) as caught:
+        screen(points(names, corners, 1e-3), points(names, rng.uniform(0, 4000, (8, 3)), NOISE_MM))
+    assert "mixed up" not in caught.value.text()
+
+
 def test_a_warm_part_needs_its_expansion_stated() -> None:
     scene = Scene(17)
     scene.j *= 1.0
