@@ -25,6 +25,7 @@ _GUARD = 1.0002
 _LEAST_PERIODS = 4
 _NEARLY = 0.98
 """A limit this near to the strictest is named before it when it stands earlier in the list: speeds first."""
+_SPEEDS = "stage speed", "lateness"
 _DIVISIONS = (1.0, 0.6, 0.3, 0.15)
 
 
@@ -55,13 +56,14 @@ def motion_along(path: RigidPath, law: TimeLaw) -> Motion:
 
 @dataclass(frozen=True, eq=False)
 class PaceLimits:
-    """What bounds one move: the axes, the stage's speed of the fastest ball or the pivot, the bus's period, settings.
+    """What bounds one move: the axes, speeds of the fastest ball or the pivot, the bus's period, settings.
 
-    `linear`: the devices interpolate each axis linearly over a period, so the chord error binds.
+    `speeds_mm_s`: what the stage asks, and what the lateness of the cycles permits. `linear`: the devices interpolate
+    each axis linearly over a period, so the chord error binds.
     """
 
     positioners: Positioners
-    speed_mm_s: float
+    speeds_mm_s: tuple[float, float]
     period_s: float
     linear: bool
     settings: PlanSettings
@@ -72,7 +74,8 @@ class PaceLimits:
         motion = motion_along(path, law)
         axes, share = self.positioners, self.settings.acceleration_share
         skew = self._skew(motion, law)
-        found = [(motion.point_speed / self.speed_mm_s, "stage speed"), (skew, "start skew of the bus")]
+        found = [(motion.point_speed / v, name) for v, name in zip(self.speeds_mm_s, _SPEEDS, strict=True)]
+        found.append((skew, "start skew of the bus"))
         found += self.jam.stretches(motion.speed.max(axis=0))
         ratios = {"speed": motion.speed.max(axis=0) / axes.v_mm_s}
         if self.settings.playback_ramp_s > 0.0:
@@ -143,7 +146,7 @@ def _s_curves_for(path: RigidPath, limits: PaceLimits) -> Iterator[TimeLaw]:
         bounds = [axes.v_mm_s / g, np.sqrt(0.25 * usable / h)]
         if ramp_s > 0.0:
             bounds.append(ramp_s * (axes.a_mm_s2 - usable) / g)
-        v = min(unjammed, limits.speed_mm_s / point_speed, *(float(np.min(bound)) for bound in bounds))
+        v = min(unjammed, min(limits.speeds_mm_s) / point_speed, *(float(np.min(bound)) for bound in bounds))
         yield s_curve(v, float(np.min((usable - h * v**2) / g)), j)
 
 

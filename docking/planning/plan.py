@@ -24,7 +24,8 @@ from docking.types import Array, Correction, Plan, PlanBounds
 @dataclass(frozen=True, eq=False)
 class PlanRequest:
     """One move to plan: `q_now_mm` (m,) commanded axis positions (read-back for passive axes), `correction` in W,
-    `speed_mm_s` of the fastest ball or the pivot, `period_s` between two rows (bus cycle or segment);
+    `speed_mm_s` of the fastest ball or the pivot, and the most that late cycles permit, `late_mm_s`; `period_s` between
+    two rows (bus cycle or segment);
     `linear_interpolation`: the devices interpolate each axis linearly between rows, so the chord error binds; `scene`:
     where component and mate are, None where nothing is near (what the mate asks is not checked then)."""
 
@@ -37,6 +38,7 @@ class PlanRequest:
     period_s: float
     linear_interpolation: bool
     scene: Scene | None = None
+    late_mm_s: float = float("inf")
 
 
 def make_plan(request: PlanRequest, positioners: Positioners, settings: PlanSettings) -> Plan:
@@ -48,7 +50,8 @@ def make_plan(request: PlanRequest, positioners: Positioners, settings: PlanSett
     room = check_strokes(path, positioners, settings)
     check_attitudes(pose_from_axes(positioners, request.q_now_mm), request.correction, positioners, settings)
     jam = jam_bound(positioners, path.axes_mm(np.array([0.0, 0.5, 1.0])), settings.jam, settings.load.up)
-    limits = PaceLimits(positioners, request.speed_mm_s, request.period_s, request.linear_interpolation, settings, jam)
+    asked = request.speed_mm_s, request.late_mm_s
+    limits = PaceLimits(positioners, asked, request.period_s, request.linear_interpolation, settings, jam)
     law, limited_by = fastest_law(path, limits)
     t_s = request.period_s * np.arange(round(law.duration_s / request.period_s) + 1, dtype=np.float64)
     s = law.at(t_s)
@@ -114,6 +117,8 @@ def _check_request(request: PlanRequest, positioners: Positioners) -> None:
         value = getattr(request, name)
         if not 0.0 < value < float("inf"):
             raise PlanInputInvalid(name, value=value, limit="positive and finite")
+    if not request.late_mm_s > 0.0:
+        raise PlanInputInvalid("speed that late cycles permit", value=request.late_mm_s, limit="positive")
     if request.q_now_mm.shape != (len(positioners.axes),):
         limit = f"one number for each of {len(positioners.axes)} axes"
         raise PlanInputInvalid("axis positions", value=str(request.q_now_mm.shape), limit=limit)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from docking.errors import PlanInputInvalid
 from docking.planning import PlanRequest, make_plan
 from docking.planning.jam import jam_bound
 from docking.planning.pace import PaceLimits, fastest_law, motion_along
@@ -20,10 +21,11 @@ def test_stretches_of_the_quintic_are_the_formula() -> None:
     """T = max(1.875 g / v, sqrt(5.7735 g / a), cbrt(60 g / j)) for a straight move of g mm."""
     path = rigid_path(rc1(), np.zeros(12), Correction(FACE, np.zeros(3), np.array([-100.0, 0.0, 0.0])))
     jam = jam_bound(rc1(), np.zeros(12), SETTINGS.jam, SETTINGS.load.up)
-    limits = PaceLimits(rc1(), 4.0, 0.01, False, replace(SETTINGS, start_skew_s=0.01, sync_error_mm=0.02), jam)
+    limits = PaceLimits(rc1(), (4.0, 8.0), 0.01, False, replace(SETTINGS, start_skew_s=0.01, sync_error_mm=0.02), jam)
     found = {name: factor for factor, name in limits.stretches(path, quintic()) if "jammed" not in name}
     assert found == {
         "stage speed": pytest.approx(1.875 * 100 / 4),
+        "lateness": pytest.approx(1.875 * 100 / 8),
         "start skew of the bus": pytest.approx(1.875 * 100 * 0.01 / 0.02),
         "A.X speed": pytest.approx(1.875 * 100 / 10),
         "A.X acceleration": pytest.approx(np.sqrt(10 / np.sqrt(3) * 100 / (0.5 * 10)), rel=1e-4),
@@ -60,7 +62,9 @@ def test_a_quarter_turn_stays_inside_its_limits_and_uses_them(
 def test_motion_along_a_turn_is_what_the_table_does() -> None:
     turn = Correction(np.zeros(3), np.radians([10.0, -20.0, 60.0]), np.array([500.0, 0.0, 0.0]))
     path = rigid_path(rc1(), np.zeros(12), turn)
-    limits = PaceLimits(rc1(), 50.0, 0.01, False, SETTINGS, jam_bound(rc1(), np.zeros(12), SETTINGS.jam, SETTINGS.load.up))
+    limits = PaceLimits(
+        rc1(), (50.0, 60.0), 0.01, False, SETTINGS, jam_bound(rc1(), np.zeros(12), SETTINGS.jam, SETTINGS.load.up)
+    )
     for law in (quintic(20.0), fastest_law(path, limits)[0]):
         motion = motion_along(path, law)
         step = 0.004
@@ -72,3 +76,19 @@ def test_motion_along_a_turn_is_what_the_table_does() -> None:
         coarse = q[::4]
         jerk = np.abs(np.diff(coarse, 3, axis=0)).max(axis=0) / (4 * step) ** 3
         np.testing.assert_allclose(motion.jerk.max(axis=0), jerk, rtol=2e-2)
+
+
+@pytest.mark.parametrize(("late", "fastest", "name"), [(0.5, 0.5, "lateness"), (5.0, 2.0, "stage speed")])
+def test_late_cycles_that_slow_a_move_are_what_sets_its_speed(late: float, fastest: float, name: str) -> None:
+    shift = Correction(FACE, np.zeros(3), np.array([-20.0, 0.0, 0.0]))
+    plan = make_plan(PlanRequest(1, "s", "k", np.zeros(12), shift, 2.0, 0.01, False, None, late), rc1(), SETTINGS)
+    assert plan.speed_limited_by == name
+    assert plan.bounds is not None
+    assert plan.bounds.peak_mm_s.max() == pytest.approx(fastest, rel=0.01)
+
+
+@pytest.mark.parametrize("late", [0.0, -1.0, float("nan")])
+def test_a_speed_of_late_cycles_that_is_none_is_refused(late: float) -> None:
+    shift = Correction(FACE, np.zeros(3), np.array([-20.0, 0.0, 0.0]))
+    with pytest.raises(PlanInputInvalid):
+        make_plan(PlanRequest(1, "s", "k", np.zeros(12), shift, 2.0, 0.01, False, None, late), rc1(), SETTINGS)

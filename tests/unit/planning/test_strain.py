@@ -50,10 +50,13 @@ def test_a_late_positioner_is_its_speed_times_its_skew_behind() -> None:
     assert later.force_n / found.force_n == pytest.approx(1.0 + 1e-4 * found.duration_s / 0.004, rel=0.02)
 
 
-def test_a_plan_that_its_own_bus_would_strain_is_refused() -> None:
-    jam = JamSettings(residual_mm=1e9, force_n=400.0, stuck_mm=1e-3, reaction_s=0.0)
+@pytest.mark.parametrize(
+    ("limits", "what"), [({"force_n": 400.0, "warp_n": 1e9}, "internal force in N"), ({"warp_n": 200.0}, "warp in N")]
+)
+def test_a_plan_that_its_own_bus_would_strain_is_refused(limits: dict[str, float], what: str) -> None:
+    jam = JamSettings(**{"residual_mm": 1e9, "force_n": 1e9, "stuck_mm": 1e-3, "reaction_s": 0.0} | limits)
     tight = replace(SETTINGS, start_skew_s=0.01, sync_error_mm=1.0, jam=jam)
-    with pytest.raises(StrainForeseen, match="internal force in N") as refusal:
+    with pytest.raises(StrainForeseen, match=what) as refusal:
         bounds((0, 0, 40), 0.0, tight, 0.1)
     assert "would fit" in refusal.value.cause
 
