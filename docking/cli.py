@@ -17,6 +17,7 @@ import click
 from docking.cli_devices import devices, monitor
 from docking.cli_fit import fit, study_pose, study_real, study_screening
 from docking.cli_guide import guide
+from docking.cli_home import home
 from docking.cli_survey import layout, network
 from docking.errors import (
     EXIT_FAULT,
@@ -271,6 +272,7 @@ study.add_command(study_real)
 cli.add_command(layout)
 cli.add_command(guide)
 cli.add_command(devices)
+cli.add_command(home)
 cli.add_command(monitor)
 cli.add_command(network)
 

@@ -232,6 +232,14 @@ class LoadUnexpected(MotionError):
     code = 2135
 
 
+class HomingFailed(MotionError):
+    code = 2136
+
+
+class HomingRefused(MotionError):
+    code = 2137
+
+
 class EmergencyStop(MotionError):
     code = 2141
 

@@ -8,8 +8,27 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from docking.config.base import Finite, Fraction, Model, Name, NonNegative, PoseVector, Positive, Vector3
+from docking.config.buses import CanBus, DriveIdentity, DriveScale, HomingConfig, ModbusBus
 from docking.config.inputs import CanModule, InputsConfig, ModbusModule
 from docking.config.instruments import GeocomConfig, InertialConfig, NdiConfig
+
+__all__ = [
+    "AxisConfig",
+    "CanBus",
+    "CellFile",
+    "DriveIdentity",
+    "DriveScale",
+    "ErsPoint",
+    "HomingConfig",
+    "LimitsConfig",
+    "LoadCellConfig",
+    "ModbusBus",
+    "MotionConfig",
+    "Noise",
+    "PositionerConfig",
+    "SettleConfig",
+    "TrackerConfig",
+]
 
 
 class Noise(Model):
@@ -62,121 +81,15 @@ class TrackerConfig(Model):
     geocom: GeocomConfig | None = Field(default=None, description="settings of a GeoCOM instrument")
 
 
-Word32 = Annotated[int, Field(ge=0, le=0xFFFF_FFFF)]
-Turns = Annotated[int, Field(ge=1, le=0xFFFF_FFFF)]
-
-
-class DriveIdentity(Model):
-    vendor: Word32 | None = Field(default=None, description="1018h:01 of every drive; any when left out")
-    product: Word32 | None = Field(default=None, description="1018h:02 of every drive; any when left out")
-    revision: Word32 | None = Field(default=None, description="1018h:03 of every drive; any when left out")
-
-
-class DriveScale(Model):
-    encoder_increments: Turns = Field(description="increments of one motor revolution, 608Fh")
-    gear: tuple[Turns, Turns] = Field(
-        default=(1, 1), description="motor revolutions for so many revolutions of the screw, 6091h"
-    )
-    mm_per_revolution: Positive = Field(
-        description="travel of one revolution of the screw, mm; 6092h must state it in counts_per_mm"
-    )
-
-
-Framing = Literal["8N1", "8N2", "8E1", "8O1"]
-
-
-class CanBus(Model):
-    kind: Literal["canopen"] = Field(description="twelve or fewer CiA 402 drives that take one position each cycle")
-    interface: str = Field(description="python-can interface name, such as socketcan")
-    channel: str = Field(description="python-can channel, such as can0")
-    further_channels: tuple[str, ...] = Field(
-        default=(), description="further buses of the same kind; a positioner says by can_channel which is its own"
-    )
-    sync_skew_s: NonNegative = Field(
-        default=0.001,
-        description="with further_channels: largest time between the SYNCs of one cycle on two of the buses, s",
-    )
-    bitrate: Literal[125000, 250000, 500000, 1000000] = Field(default=1000000, description="bit/s")
-    cycle_s: Annotated[float, Field(ge=0.002, le=0.1)] = Field(default=0.01, description="SYNC period, s")
-    heartbeat_s: Annotated[float, Field(ge=0.02, le=1.0)] = Field(
-        default=0.1, description="heartbeat period of master and drives, s"
-    )
-    drive_timeout_s: Annotated[float, Field(ge=0.05, le=2.0)] = Field(
-        default=0.28, description="a drive stops by itself when the master's heartbeat is silent this long, s"
-    )
-    prove_watchdog: bool = Field(
-        default=False,
-        description="at every start, with the axes disabled, the heartbeat pauses until every drive has missed it",
-    )
-    map: str = Field(default="cia402", description="object map in drivers/maps")
-    counts_per_mm: Positive = Field(default=10000.0, description="position units of the drives in one mm")
-    identity: DriveIdentity = Field(
-        default=DriveIdentity(), description="vendor, product and revision that every drive must show (1018h)"
-    )
-    scale: DriveScale | None = Field(
-        default=None, description="encoder, gear and screw that every drive must state; not compared when left out"
-    )
-    servo_lag_s: Annotated[float, Field(ge=0.0, le=0.1)] = Field(
-        default=0.002, description="following error of a healthy axis, divided by its speed, s"
-    )
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """All buses of the cell, the first first."""
-        return (self.channel, *self.further_channels)
-
-    @property
-    def start_skew_s(self) -> float:
-        """How far apart two axes may begin one cycle: nothing on one SYNC."""
-        return self.sync_skew_s if self.further_channels else 0.0
-
-
-class ModbusBus(Model):
-    kind: Literal["modbus-tcp", "modbus-rtu"] = Field(
-        description="positioner PLCs with a segment queue and a common RUN line, each at an address or all on one line"
-    )
-    line: str | None = Field(default=None, description="modbus-rtu: serial port of all positioners, any pyserial URL")
-    baud: Annotated[int, Field(ge=9600, le=1_000_000)] = Field(
-        default=115200, description="modbus-rtu: speed of the line, bit/s"
-    )
-    framing: Framing = Field(
-        default="8N1", description="modbus-rtu: data bits, parity (None, Even, Odd), stop bits of a character"
-    )
-    segment_s: Annotated[float, Field(ge=0.02, le=0.5)] = Field(
-        default=0.1, description="duration of one queued segment, s"
-    )
-    poll_s: Annotated[float, Field(ge=0.01, le=0.5)] = Field(default=0.05, description="period of the read-back, s")
-    timeout_s: Annotated[float, Field(ge=0.01, le=2.0)] = Field(
-        default=0.05, description="longest time one reply may take, s"
-    )
-    watchdog_s: Annotated[float, Field(ge=0.05, le=2.0)] = Field(
-        default=0.12, description="a PLC stops by itself when the host is silent this long, s"
-    )
-    ramp_s: Annotated[float, Field(ge=0.05, le=5.0)] = Field(
-        default=0.5, description="playback rate 1 -> 0 on hold or stop, s"
-    )
-    start_skew_s: NonNegative = Field(default=0.001, description="largest difference of the common start edge, s")
-    clock_ppm: NonNegative = Field(default=50.0, description="largest deviation of a controller's clock, ppm")
-    scan_s: Annotated[float, Field(ge=0.001, le=0.1)] = Field(
-        default=0.01, description="scan of the controllers, compared with what they say of themselves, s"
-    )
-    servo_lag_s: Annotated[float, Field(ge=0.0, le=0.06)] = Field(
-        default=0.002, description="following error of a healthy axis, divided by its speed, s"
-    )
-    map: str = Field(default="positioner_plc", description="register map in drivers/maps")
-
-    @model_validator(mode="after")
-    def _line_where_there_is_one(self) -> Self:
-        if (self.kind == "modbus-rtu") != (self.line is not None):
-            raise ValueError("'line' belongs to kind 'modbus-rtu', which needs it")
-        return self
-
-
 class AxisConfig(Model):
     name: Literal["X", "Y", "Z"] = Field(description="X, Y or Z; the axis is called positioner.axis")
     node: Annotated[int, Field(ge=1, le=127)] | None = Field(default=None, description="CANopen node id")
     serial_number: Annotated[int, Field(ge=1, le=0xFFFF_FFFF)] | None = Field(
         default=None, description="expected serial number of the drive (1018h:04); any when left out"
+    )
+    home_mm: Finite = Field(default=0.0, description="position that the axis has at its home (607Ch), mm")
+    homing_method: Annotated[int, Field(ge=1, le=37)] | None = Field(
+        default=None, description="homing method of this axis where it is not homing.method"
     )
     direction: Vector3 = Field(description="real axis direction times scale, in W")
     driven: bool = Field(
@@ -393,6 +306,9 @@ class CellFile(Model):
     limits: LimitsConfig = Field(default=LimitsConfig(), description="where the cell stops or refuses")
     settle: SettleConfig = Field(default=SettleConfig(), description="standstill before measuring")
     motion: MotionConfig = Field(default=MotionConfig(), description="the process that moves the axes")
+    homing: HomingConfig | None = Field(
+        default=None, description="how the drives find their zero; with it a drive that is not homed is not enabled"
+    )
     permissives: tuple[Name, ...] = Field(default=(), description="named inputs the cell offers")
     inputs: InputsConfig | None = Field(
         default=None, description="inputs that are wired; without them the operator declares the permissives"

@@ -82,13 +82,25 @@ class NodeBringUp:
         identity = await self._proof.who()
         await self._proof.scale()
         of_mode = self._map.force_mode.written if self._holds_force else self.position_mode.written
-        for name, value in self._map.written + of_mode:
-            number = given[value[1:]] if isinstance(value, str) else value
-            await self._write(self._map.objects[name], number)
+        await self.write_all(self._map.written + of_mode, given)
         await self._map_pdos()
         await self._set_mode()
         self._proof.refuse_twin()
         return identity
+
+    async def write_all(self, written: tuple[tuple[str, int | str], ...], given: dict[str, int]) -> None:
+        """Write objects in this order, each read back; texts are `@` quantities of `given`. Raises as `run`."""
+        for name, value in written:
+            number = given[value[1:]] if isinstance(value, str) else value
+            await self._write(self._map.objects[name], number)
+
+    async def is_homed(self) -> bool:
+        """Whether the drive knows its zero: only in homing mode does it say so. Back in its own mode afterwards."""
+        homing, objects = self._map.homing, self._map.objects
+        await self._show_mode(homing.mode)
+        attained = bool(await self.sdo.read(objects["statusword"]) >> homing.attained & 1)
+        await self._set_mode()
+        return attained
 
     async def standing(self) -> tuple[int, int]:
         """Statusword and position (counts) as they are before the first read-back frame."""
@@ -146,9 +158,11 @@ class NodeBringUp:
         return ObjectEntry(f"{pdo.name}_pdo_{what}", index, sub, kind)
 
     async def _set_mode(self) -> None:
-        """Select the mode and wait until the drive displays it: a write alone proves nothing."""
+        await self._show_mode(self._map.force_mode.mode if self._holds_force else self.position_mode.mode)
+
+    async def _show_mode(self, mode: int) -> None:
+        """Select a mode and wait until the drive displays it: a write alone proves nothing."""
         objects, loop = self._map.objects, asyncio.get_running_loop()
-        mode = self._map.force_mode.mode if self._holds_force else self.position_mode.mode
         await self._write(objects["mode"], mode)
         deadline = loop.time() + _MODE_S
         while await self.sdo.read(objects["mode_display"]) != mode:

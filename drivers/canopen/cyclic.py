@@ -267,6 +267,16 @@ class CyclicImage:
         self._decode()
         return self._states[index]
 
+    def word(self, index: int) -> int:
+        """The statusword."""
+        self._decode()
+        return self._words[index]
+
+    def position_mm(self, index: int) -> float:
+        """Where the drive says that the axis stands."""
+        self._decode()
+        return float(self._position[index])
+
     def brake_closed(self, index: int) -> bool:
         self._decode()
         return bool(self._words[index] & self._brake)

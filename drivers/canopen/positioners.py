@@ -4,22 +4,34 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from typing import Any
 
 import numpy as np
 
 from docking.config.cell import CellFile
-from docking.errors import DeviceSilent, EnableFailed, LinkLost, ReadBackMismatch, WatchdogUnproved
+from docking.errors import (
+    AxisUnreferenced,
+    ConfigInvalid,
+    DeviceSilent,
+    EnableFailed,
+    HomingRefused,
+    LinkLost,
+    ReadBackMismatch,
+    WatchdogUnproved,
+)
 from docking.ports import CanFrame, CanLink
 from docking.types import Array, Feedback, Identity, readonly
 from drivers.canopen import cia402, codec
 from drivers.canopen.bring_up import NodeBringUp, quantities
 from drivers.canopen.cia402 import DriveState
 from drivers.canopen.cyclic import CyclicImage
+from drivers.canopen.homing import HomingGroup, HomingRules
+from drivers.canopen.keeper import Keeper
 from drivers.canopen.nodes import axis_nodes, can_bus_of
 from drivers.canopen.power import PowerGroup
 from drivers.canopen.ramps import QuickStopRamps
+from drivers.canopen.router import Router
 from drivers.canopen.watch import NodeWatch
 from drivers.maps.objects import load_object_map
 
@@ -28,11 +40,12 @@ _EDGE_CYCLES = 3
 """SYNCs for a drive to see an edge in its controlword."""
 _WATCHDOG_MARGIN = 1.1
 """A drive may miss the heartbeat this much later than it was told: its own clock, its own cycle."""
+NOT_HOMED = "The drive does not know its zero: home it, free of any component."
 _UNDER_TORQUE = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 
 
 class CanopenPositioners:
-    """The `StreamedPositioners` port over CiA 402 drives.
+    """The `StreamedPositioners` port over CiA 402 drives. `unhomed` are the axes whose zero is not to be trusted.
 
     Someone must send SYNC every `cycle_s` from bring-up to closing. Until the first `send` after enabling, and while
     enabling or closing, this class does so itself; then the caller's tick does, and its end is the end of SYNC and of
@@ -42,6 +55,8 @@ class CanopenPositioners:
     def __init__(self, cell: CellFile, link: CanLink) -> None:
         self._bus, self._limits, self._link = can_bus_of(cell), cell.limits, link
         self._wire = ", ".join(self._bus.channels)
+        self._homing = cell.homing
+        self.unhomed: set[str] = set()
         self._map = load_object_map(self._bus.map)
         self._nodes = axis_nodes(cell, self._map.host_node)
         self.axes: tuple[str, ...] = cell.axis_names
@@ -55,9 +70,9 @@ class CanopenPositioners:
         self._ramps = QuickStopRamps(self._setups, ramp, self.a_quick_mm_s2, self._bus.counts_per_mm)
         self._heartbeat = codec.heartbeat(self._map.host_node)
         self._loop: asyncio.AbstractEventLoop
-        self._handlers = self._routes()
-        self._keeper: asyncio.TimerHandle | None = None
-        self._keeper_due_s = self._sync_s = self._beat_s = self._beat_due_s = 0.0
+        self._router = Router(self._setups, self._image, self._watch)
+        self._sync_s = self._beat_s = self._beat_due_s = 0.0
+        self._keeper = Keeper(self.cycle_s, self._cycle, self._sent_s, lambda: self._lost is not None)
         self._lost: str | None = None
         self._open = self._live = self._first = self._sequencing = self._stopping = self._silent = False
 
@@ -74,7 +89,7 @@ class CanopenPositioners:
         self._send([codec.nmt(codec.NMT_PRE_OPERATIONAL, node.node) for node in self._nodes])
         identities = await self._together([self._prepare(setup) for setup in self._setups])
         self._send([codec.nmt(codec.NMT_START, node.node) for node in self._nodes])
-        self._keep()
+        self._keeper.begin()
         await self._all_reporting()
         self._refuse_powered_passive()
         await self._settle_power()
@@ -97,7 +112,7 @@ class CanopenPositioners:
             for node in self._nodes:
                 if self._image.state(node.index) in _UNDER_TORQUE:
                     raise WatchdogUnproved(node.name, "the axis is enabled, so it was not tried", limit=limit_s)
-            self._keep()
+            self._keeper.begin()
             self._beat_due_s = math.inf
             while waiting := missed.keys() - self._watch.reported:
                 if not (self._loop.time() - self._beat_s <= limit_s):
@@ -118,10 +133,12 @@ class CanopenPositioners:
             raise EnableFailed(self._wire, "the bus has not been brought up", value="bus closed")
         if self._silent:
             raise EnableFailed(self._wire, "the hardware chain was opened: start again", value="silent")
+        if self.unhomed:
+            raise AxisUnreferenced(", ".join(n.name for n in self._nodes if n.name in self.unhomed), NOT_HOMED)
         self._live, self._stopping, self._sequencing = False, False, True
         self._watch.rearm()
         try:
-            self._keep()
+            self._keeper.begin()
             await self._all_reporting()
             await self._power.enable(self._limits.following_error_rest_mm, self._limits.reaction_min_fraction)
             self._live = self._first = True
@@ -130,6 +147,34 @@ class CanopenPositioners:
         finally:
             self._sequencing = False
         return self._image.feedback(self._sync_s, self._watch)
+
+    async def home(self, axes: Sequence[str], asked_to_stop: Callable[[], str | None] = lambda: None) -> None:
+        """Home these driven axes together; free of any component, disabled. After bring-up, before enabling.
+
+        `asked_to_stop` is looked at in every cycle: a reason halts the group. Raises HomingRefused before anything
+        moves; HomingFailed naming an axis after all stand, none of them homed then; as bring-up where a drive cannot be
+        prepared; LinkLost.
+        """
+        self._require_link()
+        if self._homing is None:
+            raise ConfigInvalid(self._wire, ("homing: missing in the cell file",))
+        if self._sequencing or self._live:
+            raise HomingRefused(
+                self._wire, "Its axes are being enabled, moved or homed.", value="busy", limit="at rest"
+            )
+        setups = [setup for setup in self._setups if setup.node.name in axes and setup.node.driven]
+        rules = HomingRules(self._homing, self._map, self._bus.counts_per_mm, self._step, self._trouble, asked_to_stop)
+        group, done = HomingGroup(self._image, setups, rules), False
+        self._keeper.begin()
+        self._watch.rearm()
+        self._sequencing = True
+        try:
+            await group.run()
+            done = True
+        finally:
+            self._sequencing = False
+            if group.begun:
+                (self.unhomed.difference_update if done else self.unhomed.update)(s.node.name for s in setups)
 
     def latest(self) -> Feedback:
         """The newest read-back."""
@@ -142,9 +187,8 @@ class CanopenPositioners:
         the axes stand; nothing is sent then.
         """
         self._require_link()
-        if self._keeper is not None and not self._sequencing:
-            self._keeper.cancel()
-            self._keeper = None
+        if not self._sequencing:
+            self._keeper.end()
         if self._live:
             self._image.aim_mm(setpoint_mm)
             if self._first:
@@ -182,9 +226,7 @@ class CanopenPositioners:
     def go_silent(self) -> None:
         """Send nothing any more, neither SYNC nor heartbeat, not even on closing. Never waits, never raises."""
         self._live, self._silent = False, True
-        if self._keeper is not None:
-            self._keeper.cancel()
-            self._keeper = None
+        self._keeper.end()
 
     async def reset_faults(self) -> None:
         """Reset drives that are in fault and forget what the nodes reported; `send` goes on meanwhile.
@@ -213,7 +255,7 @@ class CanopenPositioners:
             return
         try:
             if self._lost is None and not self._silent and self._image.cycles:
-                self._keep()
+                self._keeper.begin()
                 await self._settle_power()
                 await self._ramps.restore()
                 self._watch.disarm()
@@ -221,9 +263,7 @@ class CanopenPositioners:
         except LinkLost:
             self._live = False
         finally:
-            if self._keeper is not None:
-                self._keeper.cancel()
-                self._keeper = None
+            self._keeper.end()
             self._open = False
             self._link.close()
 
@@ -233,6 +273,8 @@ class CanopenPositioners:
         statusword, position = await setup.standing()
         self._image.seed(setup.node.index, statusword, position)
         self._image.choose(setup.node.index, setup.position_mode)
+        if self._homing is not None and setup.node.driven and not await setup.is_homed():
+            self.unhomed.add(setup.node.name)
         return identity
 
     async def _together(self, jobs: Sequence[Coroutine[Any, Any, Identity]]) -> tuple[Identity, ...]:
@@ -305,21 +347,8 @@ class CanopenPositioners:
             )
         self._first = False
 
-    def _keep(self) -> None:
-        """Begin to send SYNC in every cycle in which nobody else does."""
-        if self._keeper is None:
-            self._keeper_due_s = self._loop.time()
-            self._keeper_tick()
-
-    def _keeper_tick(self) -> None:
-        now_s = self._loop.time()
-        if self._lost is not None:
-            self._keeper = None
-            return
-        if self._image.cycles == 0 or not (now_s - self._sync_s < 0.9 * self.cycle_s):
-            self._cycle()
-        self._keeper_due_s = max(self._keeper_due_s + self.cycle_s, now_s)
-        self._keeper = self._loop.call_at(self._keeper_due_s, self._keeper_tick)
+    def _sent_s(self) -> float:
+        return self._sync_s if self._image.cycles else math.nan
 
     async def _step(self) -> None:
         """Let one cycle pass. Raises LinkLost, or EnableFailed when a quick stop came in between."""
@@ -338,36 +367,27 @@ class CanopenPositioners:
         if self._lost is not None:
             raise LinkLost(self._wire, self._lost)
 
+    def _trouble(self, indices: Sequence[int]) -> tuple[str, str] | None:
+        """The first node that is not well, and why: any that complains, one of `indices` that is not heard."""
+        if self._watch.worst is not None:
+            name, code, text = self._watch.worst
+            return name, f"{text} ({code:04X}h)."
+        for index in indices:
+            if self._image.state(index) in (DriveState.FAULT, DriveState.FAULT_REACTION):
+                return self._nodes[index].name, self._cause_of(index)
+            if not (self._image.age_cycles(index) <= self._limits.missing_cycles):
+                return self._nodes[index].name, "Its read-backs are missing."
+        return None
+
     def _cause_of(self, index: int) -> str:
         _, code, text = self._watch.fault_of(index)
         return f"{text} ({code:04X}h)"
 
     # frames from the bus -----------------------------------------------------------------------------------------
-    def _routes(self) -> dict[int, tuple[str, int]]:
-        """COB-ID -> (what it is, index of the axis), for everything but read-backs."""
-        routes: dict[int, tuple[str, int]] = {}
-        for node in self._nodes:
-            routes[codec.COB_SDO_REPLY + node.node] = ("sdo", node.index)
-            routes[codec.COB_HEARTBEAT + node.node] = ("heartbeat", node.index)
-            routes[codec.COB_EMERGENCY + node.node] = ("emergency", node.index)
-        for cob, index in zip(self._image.set_point_cobs, self._image.powered, strict=True):
-            routes[cob] = ("foreign", index)
-        return routes
-
     def _on_frames(self, batch: list[CanFrame]) -> None:
-        for cob, data in self._image.take_batch(batch):
-            route = self._handlers.get(cob)
-            if route is None:
-                continue
-            kind, index = route
-            if kind == "sdo":
-                self._setups[index].sdo.on_reply(data)
-            elif kind == "heartbeat":
-                self._watch.on_heartbeat(index, data, self._loop.time())
-            elif kind == "emergency":
-                self._watch.on_emergency(index, data)
-            else:
-                self._watch.on_foreign(index)
+        rest = self._image.take_batch(batch)
+        if rest:
+            self._router.take(rest, self._loop.time())
 
     def _on_lost(self, reason: str) -> None:
         if self._lost is None:

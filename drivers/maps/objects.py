@@ -76,6 +76,21 @@ class ForceMode:
 
 
 @dataclass(frozen=True)
+class HomingMode:
+    """How axes find their zero: mode and its bit in 6502h, what starts and halts it in the controlword, the bits of the
+    statusword that tell of it, what is written before."""
+
+    supported_mode_bit: int
+    mode: int
+    start_bits: int
+    halt_bits: int
+    reached: int
+    attained: int
+    error: int
+    written: tuple[tuple[str, int | str], ...]
+
+
+@dataclass(frozen=True)
 class ObjectMap:
     """A whole object map; `written` holds constants or `@quantity` texts in the order of writing, `proved` what must
     be read without having been written."""
@@ -97,6 +112,7 @@ class ObjectMap:
     emergency: dict[str, str]
     abort: dict[str, str]
     force_mode: ForceMode
+    homing: HomingMode
 
     def emergency_text(self, code: int) -> str:
         """The words of an emergency code: the longest matching beginning of its four digits."""
@@ -132,8 +148,11 @@ def parse_object_map(raw: dict[str, Any]) -> ObjectMap:
     objects = {name: ObjectEntry(name, **entry) for name, entry in raw["objects"].items()}
     force_mode = dict(raw["force_mode"])
     force_written: dict[str, int | str] = force_mode.pop("written")
+    homing = dict(raw["homing"])
+    homing_written: dict[str, int | str] = homing.pop("written")
     of_modes = [name for mode in raw["position_modes"] for name in mode.get("written", {})]
-    unknown = [name for name in (*raw["written"], *raw["proved"], *force_written, *of_modes) if name not in objects]
+    named = (*raw["written"], *raw["proved"], *force_written, *homing_written, *of_modes)
+    unknown = [name for name in named if name not in objects]
     if unknown or any(entry.type not in _BITS for entry in objects.values()):
         raise KeyError(f"unknown object or type {unknown}")
     return ObjectMap(
@@ -154,6 +173,7 @@ def parse_object_map(raw: dict[str, Any]) -> ObjectMap:
         emergency=dict(raw["emergency"]),
         abort=dict(raw["abort"]),
         force_mode=ForceMode(**force_mode, written=tuple(force_written.items())),
+        homing=HomingMode(**homing, written=tuple(homing_written.items())),
     )
 
 

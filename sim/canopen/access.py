@@ -32,11 +32,13 @@ class ObjectAccess:
             (0x6085, 0): limits.decel_mm_s2,
             (0x607D, 1): limits.low_mm,
             (0x607D, 2): limits.high_mm,
+            (0x607C, 0): drives.homing.home_mm,
+            (0x6099, 1): drives.homing.speed_mm_s,
         }
         self._numbers: dict[int, list[int]] = {
             0x605A: limits.quick_stop_option,
             0x605E: limits.fault_option,
-            0x6060: drives.modes,
+            0x6098: drives.homing.method,
         }
 
     def live(self, index: int, obj: int, sub: int) -> int | None:
@@ -64,6 +66,8 @@ class ObjectAccess:
             self._lengths[obj, sub][index] = value / self._counts_per_mm
         elif obj in self._numbers:
             self._numbers[obj][index] = value
+        elif obj == 0x6060:
+            self._drives.select(index, value)
         elif obj == 0x6066:
             self._drives.parameters.window_s[index] = value * 1e-3
         elif obj == 0x6040:

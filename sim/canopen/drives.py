@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from docking.types import Array
+from sim.canopen.homing import HOMING, Homing
 from sim.canopen.parameters import BoolArray, ForceTargets, Parameters
 from sim.canopen.settings import DriveSettings
 
@@ -61,6 +62,7 @@ class Drives:
         self.braked: BoolArray = np.ones(count, np.bool_)
         self.following: BoolArray = np.zeros(count, np.bool_)
         self.forces = ForceTargets(count, self.parameters)
+        self.homing = Homing(count, settings.homed, settings.zero_off_mm)
         self.statuswords: NDArray[np.uint16] = np.zeros(count, np.uint16)
         self.error_codes: list[int] = [0] * count
         self.busy = False
@@ -105,6 +107,8 @@ class Drives:
         wanted = np.minimum(np.maximum(target_mm, limits.low_mm[rows]), limits.high_mm[rows])
         if self._moving_limit or wanted.tobytes() != target_mm.tobytes():
             self._note_limits(rows, wanted != target_mm)
+        if self.homing.shift_mm.any():
+            wanted = wanted - self.homing.shift_mm[rows]
         goal = self._now.copy()
         active = self.following[rows]
         goal[rows] = wanted if active.all() else np.where(active, wanted, goal[rows])
@@ -143,6 +147,12 @@ class Drives:
                 self.trip(index, FOLLOWING_ERROR, t_s)
 
     # states ------------------------------------------------------------------------------------------------------
+    def select(self, index: int, mode: int) -> None:
+        """Change the mode of operation of one axis (6060h)."""
+        if mode != self.modes[index]:
+            self.modes[index] = mode
+            self._report(index)
+
     def control(self, index: int, word: int, t_s: float) -> None:
         """Apply a controlword (CiA 402 transitions 2 to 16)."""
         before, self.controlwords[index] = self.controlwords[index], word
@@ -165,6 +175,9 @@ class Drives:
             self._enter(index, target, t_s)
         elif self.modes[index] == IP and not word & _INTERPOLATE and self.following[index]:
             self._rest(index)
+        elif self.modes[index] == HOMING and stage is Stage.OPERATION:
+            self.homing.control(index, before, word, float(self._standing_mm()[index]))
+            self._report(index)
 
     def stop_by_itself(self, index: int, t_s: float) -> None:
         """Ramp one enabled axis down for a reason of the drive's own."""
@@ -245,6 +258,7 @@ class Drives:
                 # An axis that pressed holds the position that the component has taken it to.
                 self._now = self._now.copy()
                 self._now[index] = self._standing_mm()[index]
+            self.homing.leave(index)
             self.following[index] = False
             self._goal = self._goal.copy()
             self._goal[index] = self._now[index]
@@ -268,8 +282,12 @@ class Drives:
                 now[index] = self._ramp(index, dt_s, float(now[index]))
                 self._finish_ramp(index, t_s)
             elif stage is Stage.OPERATION and not self._leads(index):
-                now[index] = standing_mm[index]
-                self._begin_following(index)
+                if self.modes[index] == HOMING and not self.braked[index] and index not in self._brake_due:
+                    now[index] = self.homing.step(index, dt_s, float(now[index]))
+                    self._report(index)
+                else:
+                    now[index] = standing_mm[index]
+                    self._begin_following(index)
             elif stage is not Stage.OPERATION:
                 if index not in self._brake_due:
                     self.powered[index] = False
@@ -341,6 +359,7 @@ class Drives:
         word |= _LIMIT if self._limited[index] or self._switched[index] else 0
         word |= _BRAKE if self.braked[index] else 0
         word |= _WINDOW if self.error_codes[index] == FOLLOWING_ERROR else 0
+        word |= self.homing.bits(index) if self.modes[index] == HOMING else 0
         self.statuswords[index] = word
         self.changed = True
 

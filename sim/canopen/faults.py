@@ -30,6 +30,7 @@ class DriveFaults:
 
     def shown_mm(self, encoder_mm: Array) -> Array:
         """What the drives report of the encoders' positions (m,)."""
+        encoder_mm = self._group.drives.homing.shown_mm(encoder_mm)
         return self._sign * encoder_mm + self._offset_mm if self._misread else encoder_mm
 
     # the network ---------------------------------------------------------------------------------------------------

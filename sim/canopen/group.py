@@ -20,14 +20,14 @@ from sim.canopen.faulty_wire import FaultyWire
 from sim.canopen.heartbeats import Heartbeats
 from sim.canopen.node import PRE_OPERATIONAL, Node
 from sim.canopen.parameters import BoolArray
-from sim.canopen.plant_axes import NEWTON_PER_COUNT, PlantAxes
+from sim.canopen.plant_axes import PlantAxes
+from sim.canopen.read_backs import ReadBacks, force_frames
 from sim.canopen.settings import DriveSettings
 from sim.wires.can_frames import CanEnd, CanFrame
 
 _SYNC = 0x80
 _RPDO: Final = np.dtype([("controlword", "<u2"), ("target", "<i4"), ("mode", "i1")])
 _FORCE_RPDO: Final = np.dtype([("controlword", "<u2"), ("target", "<i2"), ("mode", "i1")])
-_TPDO: Final = np.dtype([("statusword", "<u2"), ("position", "<i4"), ("error", "<i2")])
 _LONG_S: Final = 0.05
 _SHORTEST_CYCLES: Final = 0.9
 """With `shared_cpu` no SYNC counts as less than this much of a cycle after the one before."""
@@ -50,6 +50,7 @@ class DriveGroup:
         self.axes = cell.axis_names
         self.faults = DriveFaults(self, self._link, self.axes, self._counts_per_mm)
         self.drives = Drives(plant.encoder_mm(), cell.bus.cycle_s, settings, self.emergency)
+        self.drives.homing.on_zero = self.forget_read_backs
         numbers = [axis.node or 0 for p in cell.positioners for axis in p.axes]
         self.nodes = [Node(i, number, settings, self) for i, number in enumerate(numbers)]
         self._handlers: dict[int, tuple[Node, str]] = {}
@@ -65,9 +66,7 @@ class DriveGroup:
         self._start_images()
 
     def _start_images(self) -> None:
-        count = len(self.nodes)
-        self._table = np.zeros(count, _TPDO)
-        self._table_encoder: Array | None = None
+        self._read_backs = ReadBacks(len(self.nodes), self._counts_per_mm, self.faults.shown_mm)
         self._error: Array = self._plant.following_error_mm()
         self._cached: list[CanFrame] | None = None
         self._pending, self._pending_forces = dict[int, bytes](), dict[int, bytes]()
@@ -122,7 +121,8 @@ class DriveGroup:
 
     def forget_read_backs(self) -> None:
         """What the drives report has changed although nothing has moved."""
-        self._cached = self._table_encoder = None
+        self._cached = None
+        self._read_backs.forget()
 
     # frames ------------------------------------------------------------------------------------------------------
     def _on_frames(self, batch: list[CanFrame]) -> None:
@@ -261,32 +261,14 @@ class DriveGroup:
         """Send the read-backs; the same bytes again while nothing moves."""
         frames = self._cached
         if frames is None or self.drives.changed:
-            frames = self._cached = self._encode()
+            words, encoder = self.drives.statuswords, self._plant.encoder_mm()
+            frames = self._cached = self._read_backs.frames(self._reporting, encoder, self._error, words)
+            self.drives.changed = False
         if self._syncs % 10 == 0 and self._force_cobs:
-            frames = frames + self._forces()
+            frames = frames + force_frames(self._force_cobs, self._plant.force_n()[self._force_index])
         self._syncs += 1
         if frames:
             self._link.send(frames)
-
-    def _encode(self) -> list[CanFrame]:
-        plant, table = self._plant, self._table
-        encoder = plant.encoder_mm()
-        if encoder is not self._table_encoder:
-            table["position"] = np.rint(self.faults.shown_mm(encoder) * self._counts_per_mm)
-            self._table_encoder = encoder
-        # The low 16 bits of the 32-bit following error: larger errors wrap, as on a real drive.
-        table["error"] = np.rint(self._error * self._counts_per_mm).astype(np.int64)
-        table["statusword"] = self.drives.statuswords
-        self.drives.changed = False
-        raw = table.tobytes()
-        return [(cob, raw[8 * i : 8 * i + 8]) for cob, i in self._reporting]
-
-    def _forces(self) -> list[CanFrame]:
-        counts = np.rint(self._plant.force_n()[self._force_index] / NEWTON_PER_COUNT)
-        # A broken load cell shows the most negative number.
-        counts[np.isnan(counts)] = -32768.0
-        raw = np.maximum(np.minimum(counts, 32767.0), -32768.0).astype("<i2").tobytes()
-        return [(cob, raw[2 * i : 2 * i + 2]) for i, cob in enumerate(self._force_cobs)]
 
     def _latch_all(self, joined: bytes, now_s: float) -> None:
         """The set-points of all drives at once."""
@@ -315,7 +297,7 @@ class DriveGroup:
     def _obey(self, rows: list[int], image: NDArray[np.void], now_s: float) -> None:
         """Modes and controlwords of the axes `rows`."""
         for index, word, mode in zip(rows, image["controlword"].tolist(), image["mode"].tolist(), strict=True):
-            self.drives.modes[index] = mode
+            self.drives.select(index, mode)
             self.drives.control(index, word, now_s)
 
     def _latch_each(self, now_s: float) -> None:

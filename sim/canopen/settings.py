@@ -29,8 +29,13 @@ class DriveSettings:
     vendor: int = 0x0000_05D0
     product: int = 0x0402_0008
     revision: int = 0x0001_0003
-    supported_modes: int = 1 << 7 | 1 << 9
-    """6502h: bit n - 1 is mode n. The drives know 7 (interpolated), 8 (cyclic position) and 10 (cyclic torque)."""
+    supported_modes: int = 1 << 5 | 1 << 7 | 1 << 9
+    """6502h: bit n - 1 is mode n. The drives know 6 (homing), 7 (interpolated), 8 (cyclic position) and 10 (cyclic
+    torque)."""
+    homed: bool = True
+    """Whether the drives know their zero when they are switched on, as those with absolute encoders do."""
+    zero_off_mm: float = 0.0
+    """By how much they count wrong until they are homed."""
     first_serial: int = 402_000
     """Serial number of node n is `first_serial` + n."""
 

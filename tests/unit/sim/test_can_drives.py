@@ -61,9 +61,7 @@ async def enabled(raw: Raw) -> None:
     """Bring the drives up with the product's own master, then take the bus over by hand."""
     await raw.bench.master.bring_up()
     await raw.bench.master.enable()
-    keeper = raw.bench.master._keeper
-    assert keeper is not None
-    keeper.cancel()
+    raw.bench.master._keeper.end()
     raw.bench.near.on_frames = raw.heard.extend
     await asyncio.sleep(0.008)
 

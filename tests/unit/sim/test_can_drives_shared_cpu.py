@@ -73,7 +73,7 @@ def test_without_it_the_axes_would_jump() -> None:
 def test_a_controller_that_stops_is_noticed_after_the_stated_cycles(cycles: float) -> None:
     async def scenario(bench: Bench) -> None:
         await bench.ready()
-        bench.master._keeper.cancel()  # type: ignore[union-attr]
+        bench.master._keeper.end()
         for _ in range(round(cycles - 1.5)):
             # The rest of the controller goes on: only SYNC is missing.
             bench.near.send([(0x77F, b"\x05")])
