@@ -9,6 +9,8 @@ from math import isnan
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from docking.errors import BadArgument
 from docking.guidance.colmap_files import read_model
 from docking.guidance.detection import MarkerDetector, MarkerSighting
@@ -34,6 +36,8 @@ Method = Literal["published", "joint", "single-aruco"]
 Builder = Literal["own", "colmap", "tum"]
 METHODS: tuple[Method, ...] = ("published", "joint", "single-aruco")
 BUILDERS: tuple[Builder, ...] = ("own", "colmap", "tum")
+_LEAST_SPAN = 0.5
+_DOUBTFUL_RMS_MM = 3.0
 _PLACE = {"published": published, "joint": joint, "single-aruco": single_aruco}
 
 
@@ -153,8 +157,24 @@ def _quality(
         marker_rms_mm=None if isnan(rms) else rms,
         reprojection_rms_px=reprojection_rms_px(ar_map),
         build_s=scanned.build_s,
-        notices=(*scanned.notices, *named, *placed.notices),
+        notices=(*scanned.notices, *named, *placed.notices, *_doubts(placed, layout, quality.method, rms)),
     )
+
+
+def _doubts(placed: Placed, layout: MarkerLayout, method: str, rms_mm: float) -> tuple[str, ...]:
+    """What a person must know before trusting the frame."""
+    if method == "single-aruco":
+        return ()
+    used = [layout.circles_mm[k] for k, marker in enumerate(layout.ids) if marker in placed.markers_used]
+    known = np.concatenate(used) if used else np.zeros((1, 3))
+    cameras = np.array([frame.X_WC.t_mm for frame in placed.ar_map.keyframes])
+    span, size = (float(np.linalg.norm(np.ptp(points, axis=0))) for points in (known, cameras))
+    doubts = []
+    if span < _LEAST_SPAN * size:
+        doubts.append(f"the markers span {span:.0f} mm of a scan of {size:.0f} mm: far from them the frame is a guess")
+    if not (rms_mm <= _DOUBTFUL_RMS_MM):
+        doubts.append(f"the circles lie {rms_mm:.1f} mm rms from their survey in the finished map")
+    return tuple(doubts)
 
 
 def map_json(ar_map: ArMap) -> dict[str, Any]:

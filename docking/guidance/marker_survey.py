@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from docking.errors import MarkersDisagree, MarkersTooFew
 from docking.guidance.detection import Gate, MarkerSighting
-from docking.guidance.similarity import Similarity, collinear, consistent, refined
+from docking.guidance.similarity import Similarity, closed_form, collinear, consistent, refined
 from docking.guidance.triangulation import dlt, parallax_deg
 from docking.guidance.types import ArMap, Camera, KeyFrame, MarkerLayout
 from docking.types import Array
@@ -23,11 +23,18 @@ Sightings = tuple[tuple[MarkerSighting, ...], ...]
 
 @dataclass(frozen=True)
 class RegistrationSettings:
-    """`gate` for the method as published; `wide_gate` where every observation has a weight of its own (joint)."""
+    """`gate` for the method as published; `wide_gate` where every observation has a weight of its own (joint).
+
+    Circles agree within `tolerance_mm`, less where the markers stand close together: a map drifts by a share of its
+    size, so a small one must fit better. `shape_mm`: how far a circle may be from the figure of its marker's four.
+    """
 
     gate: Gate = field(default_factory=Gate)
     wide_gate: Gate = field(default_factory=lambda: Gate(distance_mm=2000.0, angle_deg=50.0, circles=1))
     tolerance_mm: float = 12.0
+    near_tolerance_mm: float = 2.0
+    drift_share: float = 0.005
+    shape_mm: float = 1.5
     least_share: float = 0.6
     least_parallax_deg: float = 1.0
     spread_px: float = 4.0
@@ -114,13 +121,47 @@ def register(ar_map: ArMap, layout: MarkerLayout, sightings: Sightings, settings
     if len(circles.points) < 3 or collinear(circles.known_mm):
         cause = "; ".join(f"marker {i}: {why}" for i, why in rejected.items())
         raise MarkersTooFew("markers", cause, value=len(circles.points), limit=3)
-    similarity, agree = consistent(circles.points, circles.known_mm, settings.tolerance_mm)
+    tolerance_mm = _tolerance_mm(circles, settings)
+    similarity, agree = consistent(circles.points, circles.known_mm, tolerance_mm)
     rejected |= _reasons(circles, similarity, agree)
+    agree &= _shapes(circles, similarity, agree, settings.shape_mm, rejected)
     if agree.sum() < 3 or not (agree.mean() > settings.least_share) or collinear(circles.known_mm[agree]):
-        cause = f"only {int(agree.sum())} of {len(agree)} circles agree within {settings.tolerance_mm:g} mm; "
+        cause = f"only {int(agree.sum())} of {len(agree)} circles agree within {tolerance_mm:.1f} mm; "
         raise MarkersDisagree("markers", cause + "; ".join(f"marker {i}: {why}" for i, why in rejected.items()))
     kept = Circles(*(column[agree] for column in (circles.marker, circles.circle, circles.points, circles.known_mm)))
     return Registered(refined(similarity, kept.points, kept.known_mm), kept, rejected)
+
+
+def _tolerance_mm(circles: Circles, settings: RegistrationSettings) -> float:
+    extent = float(np.linalg.norm(np.ptp(circles.known_mm, axis=0)))
+    return min(settings.tolerance_mm, settings.near_tolerance_mm + settings.drift_share * extent)
+
+
+def _shapes(
+    circles: Circles, similarity: Similarity, agree: NDArray[np.bool_], shape_mm: float, rejected: dict[int, str]
+) -> NDArray[np.bool_]:
+    """Which circles fit the other three of their marker; the drift of a map cannot bend so small a figure."""
+    good = np.ones(len(circles.points), bool)
+    for marker in np.unique(circles.marker[agree]):
+        mine = np.flatnonzero((circles.marker == marker) & agree)
+        if len(mine) < 4:
+            continue
+        moved, known = similarity.apply(circles.points[mine]), circles.known_mm[mine]
+        whole = _shape_error(moved, known)
+        if whole <= shape_mm:
+            continue
+        without = [_shape_error(np.delete(moved, k, 0), np.delete(known, k, 0)) for k in range(len(mine))]
+        worst = int(np.argmin(without))
+        good[mine[worst]] = False
+        circle = int(circles.circle[mine[worst]])
+        rejected[int(marker)] = f"circle {circle} does not fit the other three ({whole:.1f} mm): a typing error?"
+    return good
+
+
+def _shape_error(moved: Array, known: Array) -> float:
+    """Largest distance (mm) after the best rigid motion."""
+    R, t = closed_form(moved, known).R, known.mean(axis=0)
+    return float(np.linalg.norm((moved - moved.mean(axis=0)) @ R.T + t - known, axis=1).max())
 
 
 def _reasons(circles: Circles, similarity: Similarity, agree: NDArray[np.bool_]) -> dict[int, str]:
