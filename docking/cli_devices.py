@@ -12,6 +12,7 @@ from docking.errors import EXIT_FAULT, EXIT_OK, BadArgument
 from docking.terminal import FILE, json_option, print_json, print_text, transcript_option
 
 WIRES = "Addresses that `docking sim` wrote; without it --sim starts its own devices."
+SILENCE = "The drives will miss their controller on purpose. Everything stands, braked, and nothing hangs on a servo?"
 CLEAR = "\x1b[H\x1b[J"
 
 
@@ -24,12 +25,28 @@ CLEAR = "\x1b[H\x1b[J"
     is_flag=True,
     help="Bring the positioners up as before a docking: settings are written and read back, nothing is enabled.",
 )
+@click.option(
+    "--prove-watchdogs",
+    is_flag=True,
+    help="Fall silent on a CAN bus until every drive has missed the heartbeat: axes at rest, disabled and braked.",
+)
+@click.option("--yes", is_flag=True, help="Do not ask before --prove-watchdogs.")
 @transcript_option
 @json_option
-def devices(cell: Path, sim: bool, wires: Path | None, prove: bool, transcript: Path | None, as_json: bool) -> int:
+def devices(
+    cell: Path,
+    sim: bool,
+    wires: Path | None,
+    prove: bool,
+    prove_watchdogs: bool,
+    yes: bool,
+    transcript: Path | None,
+    as_json: bool,
+) -> int:
     """Say who answers on the wires of a CELL: identity, firmware, state, units, watchdogs, round trip, start skew.
 
-    Reads only, without --prove. Exits with 0 when every device answers as it should, else with 1 and its name.
+    Reads only, without --prove and --prove-watchdogs. Exits with 0 when every device answers as it should, else with 1
+    and its name.
 
     \b
     Example: docking devices sim/cells/lab-can.toml --sim
@@ -37,7 +54,9 @@ def devices(cell: Path, sim: bool, wires: Path | None, prove: bool, transcript: 
     """
     from docking.assemble.commissioning import devices_text, find_devices
 
-    report = find_devices(_request(cell, sim, wires, transcript), prove=prove)
+    if prove_watchdogs and not (sim or yes):
+        click.confirm(SILENCE, abort=True, err=True)
+    report = find_devices(_request(cell, sim, wires, transcript), prove=prove, watchdogs=prove_watchdogs)
     if as_json:
         print_json(report)
     else:

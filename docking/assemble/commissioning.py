@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import statistics
+from dataclasses import dataclass
 from datetime import date
 from typing import Any
 
@@ -13,7 +14,7 @@ from docking.assemble.real_time import run_real
 from docking.assemble.timed import TimedCan, TimedSerial
 from docking.config import CellFile
 from docking.config.cell import CanBus
-from docking.errors import DockingError, LinkError
+from docking.errors import BadArgument, DockingError, LinkError, LinkLost
 from docking.ports import CanLink
 from drivers.canopen.look import BusLook
 from drivers.canopen.positioners import CanopenPositioners
@@ -21,16 +22,21 @@ from drivers.look import Found
 from drivers.modbus_look import ModbusLook
 from drivers.modbus_positioners import ModbusPositioners
 
+STRANGER = "not in the cell"
 PROVE_S = 1.0
 """How long the read-backs of a bus are timed."""
 
 
-def find_devices(request: LookRequest, *, prove: bool = False) -> dict[str, Any]:
+def find_devices(request: LookRequest, *, prove: bool = False, watchdogs: bool = False) -> dict[str, Any]:
     """Everything that `docking devices` says, as plain data. Raises ConfigError.
 
-    With `prove` the settings of positioners are written and read back as before a docking; nothing is enabled.
+    With `prove` the settings of positioners are written and read back as before a docking; nothing is enabled. With
+    `watchdogs` the heartbeat of a CAN bus is withheld besides, until every drive has missed it.
     """
     cell = load_looked_at(request)
+    if watchdogs and not isinstance(cell.bus, CanBus):
+        cause = "a CANopen bus: PLCs are not left without their host"
+        raise BadArgument("--prove-watchdogs", cause, value=cell.bus.kind)
 
     async def main() -> dict[str, Any]:
         async with wires_of(request, cell) as ends:
@@ -44,10 +50,28 @@ def find_devices(request: LookRequest, *, prove: bool = False) -> dict[str, Any]
                 skew = await look.start_skew_s()
             finally:
                 look.close()
-            proof, measured = await _prove(cell, ends) if prove else (None, None)
-            return _report(cell, rows, skew or measured, proof)
+            alone = not any(found.where == STRANGER and found.address == "SYNC" for found in rows)
+            if not (prove or watchdogs) or not alone:
+                return _report(cell, rows, skew, _Proof(None if alone or not (prove or watchdogs) else _occupied()))
+            return _report(cell, rows, skew, await _prove(cell, ends, watchdogs))
 
-    return run_real(main, ticks=prove)
+    return run_real(main, ticks=prove or watchdogs)
+
+
+@dataclass(frozen=True)
+class _Proof:
+    """What failed in a bring-up; the spread of the read-backs of one SYNC; how soon each drive missed the heartbeat."""
+
+    problem: DockingError | None = None
+    skew_s: tuple[float, float] | None = None
+    missed_s: dict[str, float] | None = None
+
+
+_UNPROVED = _Proof()
+
+
+def _occupied() -> DockingError:
+    return LinkLost("bus", "Another controller runs it: nothing was written.")
 
 
 async def _tracker(cell: CellFile, ends: Ends) -> Found:
@@ -75,13 +99,12 @@ async def _bus(cell: CellFile, link: CanLink) -> tuple[Found, ...]:
     finally:
         look.close()
     if look.controlled:
-        found = (*found, Found("not in the cell", "SYNC", state="another controller runs this bus"))
+        found = (*found, Found(STRANGER, "SYNC", state="another controller runs this bus"))
     return found
 
 
-async def _prove(cell: CellFile, ends: Ends) -> tuple[DockingError | None, tuple[float, float] | None]:
-    """Bring the positioners up as before a docking, enable nothing, release them; what failed, and the spread of the
-    read-backs of one SYNC."""
+async def _prove(cell: CellFile, ends: Ends, watchdogs: bool) -> _Proof:
+    """Bring the positioners up as before a docking, enable nothing, release them."""
     positioners: CanopenPositioners | ModbusPositioners
     timed: TimedCan | None = None
     if isinstance(cell.bus, CanBus) and ends.bus.can is not None:
@@ -90,10 +113,12 @@ async def _prove(cell: CellFile, ends: Ends) -> tuple[DockingError | None, tuple
         positioners = CanopenPositioners(cell, timed)
     else:
         positioners = ModbusPositioners(cell, ends.bus.modbus, ends.tap, ends.bus.line)
-    problem = None
+    problem, missed_s = None, None
     try:
         await positioners.bring_up()
         await asyncio.sleep(PROVE_S if timed is not None else 0.0)
+        if watchdogs and isinstance(positioners, CanopenPositioners):
+            missed_s = await positioners.prove_watchdogs()
     except DockingError as error:
         problem = error
     try:
@@ -101,15 +126,17 @@ async def _prove(cell: CellFile, ends: Ends) -> tuple[DockingError | None, tuple
     except DockingError as error:
         problem = problem or error
     if timed is None or not timed.late_s:
-        return problem, None
+        return _Proof(problem, None, missed_s)
     typical = [statistics.median(late) for late in timed.late_s.values()]
-    return problem, (max(typical) - min(typical), max(statistics.pstdev(late) for late in timed.late_s.values()))
+    spread_s = max(statistics.pstdev(late) for late in timed.late_s.values())
+    return _Proof(problem, (max(typical) - min(typical), spread_s), missed_s)
 
 
 # what is told ------------------------------------------------------------------------------------------------------
 def _report(
-    cell: CellFile, rows: list[Found], skew: tuple[float, float] | None, proof: DockingError | None
+    cell: CellFile, rows: list[Found], skew_s: tuple[float, float] | None, proved: _Proof = _UNPROVED
 ) -> dict[str, Any]:
+    proof, skew = proved.problem, skew_s or proved.skew_s
     devices = [_row(found) for found in rows]
     due = cell.tracker.calibration_due
     today = date.today()
@@ -128,6 +155,7 @@ def _report(
         "start_skew_ms": None if skew is None else 1e3 * skew[0],
         "start_skew_known_to_ms": None if skew is None else 1e3 * skew[1],
         "calibration_due": str(due) if due is not None else None,
+        "watchdogs_ms": {name: 1e3 * s for name, s in proved.missed_s.items()} if proved.missed_s else None,
         "bring_up": None if proof is None else {"code": proof.code, "message": proof.text(), "where": proof.where},
         "warnings": warnings,
     }
@@ -140,7 +168,7 @@ def _row(found: Found) -> dict[str, Any]:
         "where": found.where,
         "address": found.address,
         "answers": identity is not None,
-        "stray": found.where == "not in the cell",
+        "stray": found.where == STRANGER,
         "vendor": identity.vendor if identity else None,
         "product": identity.product if identity else None,
         "serial": identity.serial if identity else None,
@@ -171,6 +199,9 @@ def devices_text(report: dict[str, Any]) -> str:
     skew = report["start_skew_ms"]
     if skew is not None:
         lines.append(f"start skew as measured: {skew:.2f} ms, known to {report['start_skew_known_to_ms']:.2f} ms")
+    if report["watchdogs_ms"]:
+        took = report["watchdogs_ms"].values()
+        lines.append(f"every drive missed the heartbeat by itself, after {min(took):.0f} to {max(took):.0f} ms")
     if report["calibration_due"]:
         lines.append(f"calibration of the instrument due: {report['calibration_due']}")
     if report["bring_up"]:

@@ -18,7 +18,6 @@ from docking.errors import (
     HomingRefused,
     LinkLost,
     ReadBackMismatch,
-    WatchdogUnproved,
 )
 from docking.ports import CanFrame, CanLink
 from docking.types import Array, Feedback, Identity, readonly
@@ -33,15 +32,13 @@ from drivers.canopen.power import PowerGroup
 from drivers.canopen.ramps import QuickStopRamps
 from drivers.canopen.router import Router
 from drivers.canopen.watch import NodeWatch
+from drivers.canopen.watchdogs import WatchdogProof
 from drivers.maps.objects import load_object_map
 
 _START_UP_S = 1.0
 _EDGE_CYCLES = 3
 """SYNCs for a drive to see an edge in its controlword."""
-_WATCHDOG_MARGIN = 1.1
-"""A drive may miss the heartbeat this much later than it was told: its own clock, its own cycle."""
 NOT_HOMED = "The drive does not know its zero: home it, free of any component."
-_UNDER_TORQUE = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 
 
 class CanopenPositioners:
@@ -98,31 +95,26 @@ class CanopenPositioners:
         self._watch.rearm()
         return identities
 
-    async def prove_watchdogs(self) -> None:
-        """Withhold the heartbeat until every drive says that it misses it; SYNC goes on. After bring-up, axes disabled.
+    async def prove_watchdogs(self) -> dict[str, float]:
+        """Withhold the heartbeat until every drive says that it misses it; SYNC goes on. Seconds that each took.
 
-        Drives that keep this as a fault stay disabled until somebody resets them. Raises WatchdogUnproved naming the
-        axis, also where an axis is enabled; LinkLost.
+        After bring-up, axes disabled and braked. Drives that keep this as a fault stay disabled until somebody resets
+        them. Raises WatchdogUnproved naming the axis, also where one is enabled or not braked; LinkLost.
         """
         self._require_link()
-        missed = {(node.index, self._map.host_lost): node.name for node in self._nodes}
-        limit_s = _WATCHDOG_MARGIN * self._bus.drive_timeout_s + 2.0 * self.cycle_s
+        bus = self._bus
+        proof = WatchdogProof(self._image, self._watch, self._map.host_lost, bus.drive_timeout_s, bus.cycle_s)
         self._watch.rearm()
+        proof.require_still()
         try:
-            for node in self._nodes:
-                if self._image.state(node.index) in _UNDER_TORQUE:
-                    raise WatchdogUnproved(node.name, "the axis is enabled, so it was not tried", limit=limit_s)
             self._keeper.begin()
             self._beat_due_s = math.inf
-            while waiting := missed.keys() - self._watch.reported:
-                if not (self._loop.time() - self._beat_s <= limit_s):
-                    cause = "object 1016h:01 reads right, but a pause of the heartbeat has no effect"
-                    raise WatchdogUnproved(missed[min(waiting)], cause, limit=limit_s)
-                await self._step()
+            took = await proof.run(self._step, lambda: self._beat_s)
         finally:
             self._beat_due_s = 0.0
         await self._all_reporting()
         self._watch.rearm()
+        return took
 
     async def enable(self) -> Feedback:
         """Enable the driven axes as one group, each first commanded to where it stands; return their read-back.

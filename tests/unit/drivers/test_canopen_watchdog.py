@@ -117,3 +117,34 @@ def test_drives_that_keep_the_loss_as_a_fault_stay_disabled_until_somebody_reset
         await bench.master.close()
 
     run_virtual(main)
+
+
+def test_it_is_told_how_soon_every_drive_missed_the_controller() -> None:
+    async def main() -> None:
+        bench = Bench(can_cell(), DriveSettings(watchdog_scatter_s=0.02))
+        await bench.master.bring_up()
+        took = await bench.master.prove_watchdogs()
+        assert list(took) == list(bench.master.axes)
+        assert all(TIMEOUT_S - 0.03 <= s <= 1.1 * TIMEOUT_S + 0.02 for s in took.values())
+        assert max(took.values()) - min(took.values()) > 0.01
+        await bench.master.close()
+        bench.drives.close()
+
+    run_virtual(main)
+
+
+def test_it_is_not_tried_where_a_brake_is_open() -> None:
+    async def main() -> None:
+        bench = Bench(can_cell())
+        await bench.master.bring_up()
+        bench.drives.drives.braked[4] = False
+        bench.drives.drives._report(4)
+        await asyncio.sleep(0.05)
+        with pytest.raises(WatchdogUnproved) as caught:
+            await bench.master.prove_watchdogs()
+        assert caught.value.where == "B.Y"
+        assert "brake" in caught.value.text()
+        await bench.master.close()
+        bench.drives.close()
+
+    run_virtual(main)

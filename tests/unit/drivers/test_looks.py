@@ -196,7 +196,7 @@ def test_the_start_skew_is_how_far_the_scans_are_apart_around_the_clock(apart_s,
 def report(due: date | None, rows: list[Found]):
     cell, _ = files("lab-can")
     tracker = cell.tracker.model_copy(update={"calibration_due": due})
-    return _report(cell.model_copy(update={"tracker": tracker}), rows, (0.001, 0.0002), None)
+    return _report(cell.model_copy(update={"tracker": tracker}), rows, (0.001, 0.0002))
 
 
 def test_a_calibration_that_is_due_is_told():
