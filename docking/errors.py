@@ -99,6 +99,10 @@ class WatchdogUnproved(LinkError):
     code = 1008
 
 
+class LoadCellBroken(LinkError):
+    code = 1009
+
+
 # 2xxx motion -----------------------------------------------------------------------------------------------------
 class MotionError(DockingError):
     """Axes, coupling and stops."""

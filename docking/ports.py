@@ -188,6 +188,22 @@ class Inputs(Protocol):
     async def close(self) -> None: ...
 
 
+class LoadCells(Protocol):
+    """Load cells that are wired beside the axes. `on_fault` is called once when a cell's wire or module fails."""
+
+    on_fault: Callable[[DockingError], None]
+
+    async def bring_up(self) -> tuple[Identity, ...]:
+        """Prove every module, and that every cell reads."""
+        ...
+
+    def latest(self) -> Array:
+        """Newest forces along all axes (m,), N; NaN where no cell is, or nothing is known of it now."""
+        ...
+
+    async def close(self) -> None: ...
+
+
 class Motion(Protocol):
     """All the cell knows of motion: load a table, start it, hold, resume or stop on the path, see where it stands."""
 

@@ -158,6 +158,11 @@ class FaultBook:
             broken = partial(world.break_sensor, sensor.name)
             self._add(sensor.name, "broken", Fault(partial(_plain, broken), partial(broken, False)))
             self._add(sensor.name, "misread", _healed(partial(world.misread, sensor.name), by_k=0.0))
+        for force in inputs.forces:
+            torn = partial(world.break_sensor, force.name)
+            self._add(force.name, "broken", Fault(partial(_plain, torn), partial(torn, False)))
+            stray = partial(world.force_current, force.name)
+            self._add(force.name, "current", Fault(stray, partial(world.free_current, force.name)))
         for module in inputs.modules:
             mute = partial(world.mute, module.name)
             self._add(module.name, "silent", Fault(partial(_plain, mute), partial(mute, False)))

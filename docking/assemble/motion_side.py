@@ -5,26 +5,33 @@ from __future__ import annotations
 import asyncio
 import math
 from dataclasses import replace
+from functools import partial
 
 from docking.assemble.wires import Addresses, NearBus
 from docking.config import CellFile, JobFile
 from docking.config.cell import ModbusBus
 from docking.config.inputs import InputsConfig, ModbusModule
+from docking.errors import DockingError
 from docking.motion import QueuedMotion, StreamedMotion
+from docking.motion.arbiter import Mode
 from docking.motion.channel import QueueChannel
 from docking.motion.guarded import GuardedMotion, InputRules
 from docking.motion.monitors import watch_from
 from docking.motion.remote import LeaseSettings, RemoteMotion
 from docking.motion.served import LocalMotion, ServedMotion, ServiceSettings
+from docking.motion.triggers import Finding, Trigger
+from docking.ports import LoadCells
 from docking.transcript import Transcript
 from drivers.canopen.io_module import CanIoModule
 from drivers.canopen.positioners import CanopenPositioners
 from drivers.canopen.shared import SharedCan
 from drivers.inputs import SILENT_AFTER, InputModule, WiredInputs
+from drivers.load_cells import AnalogueLoadCells
 from drivers.maps.objects import load_object_map
 from drivers.modbus_client import Tap
 from drivers.modbus_inputs import ModbusIoModule
 from drivers.modbus_positioners import ModbusPositioners
+from drivers.weighed_axes import WeighedControllers, WeighedDrives
 
 
 def local_motion(cell: CellFile, job: JobFile, near: NearBus, transcript: Transcript | None = None) -> LocalMotion:
@@ -34,19 +41,32 @@ def local_motion(cell: CellFile, job: JobFile, near: NearBus, transcript: Transc
     if inputs is None:
         return _axes(cell, job, near, tap)
     shared = SharedCan(near.can) if near.can is not None else None
-    motion = _axes(cell, job, replace(near, can=shared.end()) if shared is not None else near, tap)
+    axes = replace(near, can=shared.end()) if shared is not None else near
     modules = input_modules(inputs, shared, near.modbus, tap)
+    weighing = {name: modules.pop(name) for name in sorted(inputs.weighing)}
+    cells = AnalogueLoadCells(cell, weighing) if weighing else None
+    motion = _axes(cell, job, axes, tap, cells)
+    if cells is not None:
+        cells.on_fault = partial(_force_missing, motion)
     return GuardedMotion(motion, WiredInputs(inputs, modules), input_rules(inputs))
 
 
-def _axes(cell: CellFile, job: JobFile, near: NearBus, tap: Tap | None) -> LocalMotion:
+def _force_missing(motion: LocalMotion, error: DockingError) -> None:
+    """A cell that shows nothing stops a move with its own reason; before one, the monitors let none begin."""
+    if motion.arbiter.mode is not Mode.OFF:
+        motion.report(Finding(Trigger.FORCE_MISSING, error))
+
+
+def _axes(cell: CellFile, job: JobFile, near: NearBus, tap: Tap | None, cells: LoadCells | None = None) -> LocalMotion:
     watch = watch_from(cell, job)
     if isinstance(cell.bus, ModbusBus):
-        positioners = ModbusPositioners(cell, near.modbus, tap, near.line)
+        wires = near.modbus, tap, near.line
+        positioners = ModbusPositioners(cell, *wires) if cells is None else WeighedControllers(cell, *wires, cells)
         return QueuedMotion(positioners, watch, cell.bus.poll_s)
     if near.can is None:
         raise ValueError("a CANopen cell needs the near end of its bus")
-    return StreamedMotion(CanopenPositioners(cell, near.can), watch, cell.limits.tick_late_cycles)
+    drives = CanopenPositioners(cell, near.can) if cells is None else WeighedDrives(cell, near.can, cells)
+    return StreamedMotion(drives, watch, cell.limits.tick_late_cycles)
 
 
 def input_modules(
@@ -74,7 +94,9 @@ def input_rules(inputs: InputsConfig) -> InputRules:
         emergency=inputs.names("emergency-stop"),
         protective=inputs.names("protective-stop"),
         silent_s={
-            m.name: SILENT_AFTER * (m.poll_s if isinstance(m, ModbusModule) else m.refresh_s) for m in inputs.modules
+            m.name: SILENT_AFTER * (m.poll_s if isinstance(m, ModbusModule) else m.refresh_s)
+            for m in inputs.modules
+            if m.name not in inputs.weighing
         },
         limits=of_axes["limit-switch"],
         brakes=of_axes["brake-closed"],

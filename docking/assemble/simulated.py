@@ -16,6 +16,7 @@ from docking.config import CellFile, JobFile
 from docking.config.build import plan_period_s
 from docking.config.cell import CanBus, ModbusBus
 from docking.config.inputs import CanModule, ModbusModule
+from docking.config.wired_forces import as_axes_know_it
 from docking.transcript import Transcript
 from sim.canopen.group import DriveGroup
 from sim.canopen.io_module import IoModule
@@ -91,7 +92,7 @@ class FarEnd:
         shared = SharedEnd(wire)
         # A bus of drives alone keeps its own end: every frame would pass one more pair of hands.
         end = shared.station() if modules else wire
-        group = DriveGroup(share or self.plant, cell, settings, end, self.loop)
+        group = DriveGroup(share or self.plant, as_axes_know_it(cell), settings, end, self.loop)
         if share is not None:
             share.at = group.at
         group.start()
@@ -116,7 +117,7 @@ class FarEnd:
         names = [p.name for p in cell.positioners]
         skew_s = cell.bus.start_skew_s if isinstance(cell.bus, ModbusBus) else 0.0
         late_s = np.random.default_rng([self.seed, len(names)]).uniform(0.0, skew_s, len(names)).tolist()
-        group = PlcGroup(self.plant, cell, [self.plant.clock_ppm[n] for n in names], self.loop, late_s)
+        group = PlcGroup(self.plant, as_axes_know_it(cell), [self.plant.clock_ppm[n] for n in names], self.loop, late_s)
         self.devices.append(group)
         return group
 

@@ -20,11 +20,12 @@ def input_findings(cell: CellFile) -> list[Finding]:
     if inputs is None:
         return []
     names = [(f"inputs.modules[{i}].name", m.name) for i, m in enumerate(inputs.modules)]
+    cells = [(f"inputs.forces[{i}].name", f.name) for i, f in enumerate(inputs.forces)]
     contacts = [(f"inputs.digital[{i}].name", d.name) for i, d in enumerate(inputs.digital)]
     sensors = [(f"inputs.temperatures[{i}].name", t.name) for i, t in enumerate(inputs.temperatures)]
     parts = [(f"inputs.temperatures[{i}].of", t.of) for i, t in enumerate(inputs.temperatures)]
-    findings = duplicates(names, "name") + duplicates(contacts + sensors, "name") + duplicates(parts, "part")
-    findings += _modules(cell, inputs) + _channels(inputs)
+    findings = duplicates(names, "name") + duplicates(contacts + sensors + cells, "name") + duplicates(parts, "part")
+    findings += _modules(cell, inputs) + _channels(inputs) + _forces(cell, inputs)
     for i, item in enumerate(inputs.digital):
         findings += _contact(cell, f"inputs.digital[{i}]", item)
     return findings
@@ -63,6 +64,28 @@ def _channels(inputs: InputsConfig) -> list[Finding]:
             if item.module not in known
         ]
         findings += duplicates(((f"{key}.channel", (item.module, item.channel)) for key, item in where), "channel")
+    return findings
+
+
+def _forces(cell: CellFile, inputs: InputsConfig) -> list[Finding]:
+    """Load cells have modules of their own, sit under a ball that has one, and share no wire."""
+    known = {module.name for module in inputs.modules}
+    fitted = {p.name for p in cell.positioners if p.load_cell and cell.load_cells is not None}
+    others = {item.module for item in inputs.digital} | {sensor.module for sensor in inputs.temperatures}
+    where = [(f"inputs.forces[{i}]", force) for i, force in enumerate(inputs.forces)]
+    findings = duplicates(((f"{key}.positioner", force.positioner) for key, force in where), "positioner")
+    wires = [(f"{key}.channels", (force.module, channel)) for key, force in where for channel in force.channels]
+    findings += duplicates(iter(wires), "channel")
+    for key, force in where:
+        if force.module not in known:
+            findings.append(error(f"{key}.module", f"{force.module!r} is not a module ({', '.join(sorted(known))})"))
+        if force.module in others:
+            findings.append(
+                error(f"{key}.module", f"{force.module!r} has other inputs: load cells need their own module")
+            )
+        if force.positioner not in fitted:
+            text = f"{force.positioner!r} is no positioner with load_cell = true, in a cell with load_cells"
+            findings.append(error(f"{key}.positioner", text))
     return findings
 
 

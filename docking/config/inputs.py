@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from docking.config.base import Finite, Model, Name, NonNegative, Positive
 
@@ -74,6 +74,22 @@ class TemperatureInput(Model):
     )
 
 
+class ForceInput(Model):
+    """A three-component load cell with transmitters of 4 to 20 mA; 12 mA is no force, 20 mA the whole range."""
+
+    name: Name = Field(description="of the load cell")
+    positioner: Name = Field(description="under whose ball it sits; its load_cell = true, load_cells has its range")
+    module: Name = Field(description="name of the module, which has nothing but load cells")
+    channels: tuple[Channel, Channel, Channel] = Field(description="analogue inputs of X, Y and Z, from 0")
+    counts: tuple[int, int] = Field(default=(5530, 27648), description="counts of the inputs at 4 mA and at 20 mA")
+
+    @model_validator(mode="after")
+    def _some_span(self) -> Self:
+        if not self.counts[1] - self.counts[0] >= 16:
+            raise ValueError("counts at 20 mA must be above those at 4 mA")
+        return self
+
+
 Module = Annotated[CanModule | ModbusModule, Field(discriminator="kind")]
 
 
@@ -83,6 +99,13 @@ class InputsConfig(Model):
     modules: tuple[Module, ...] = Field(min_length=1, description="what the inputs are wired to")
     digital: tuple[DigitalInput, ...] = Field(default=(), description="contacts")
     temperatures: tuple[TemperatureInput, ...] = Field(default=(), description="temperature sensors")
+
+    forces: tuple[ForceInput, ...] = Field(default=(), description="load cells")
+
+    @property
+    def weighing(self) -> frozenset[str]:
+        """Names of the modules that load cells are wired to."""
+        return frozenset(force.module for force in self.forces)
 
     def names(self, *uses: Use) -> tuple[str, ...]:
         """Names of the contacts with one of these uses."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from docking.config.cell import AxisConfig, CanBus, CellFile
 from docking.config.inputs import CanModule
+from docking.config.wired_forces import as_axes_know_it
 from docking.errors import ConfigInvalid
 
 
@@ -62,7 +63,7 @@ def axis_nodes(cell: CellFile, host_node: int) -> tuple[AxisNode, ...]:
     problems: list[str] = []
     taken = {host_node: "the controller"}
     first = can_bus_of(cell).channel
-    for positioner in cell.positioners:
+    for positioner in as_axes_know_it(cell).positioners:
         for axis in positioner.axes:
             name = f"{positioner.name}.{axis.name}"
             if axis.node is None:
