@@ -6,7 +6,7 @@ Eq. 9; its covariance follows from the covariances of the points, which differ b
 
 from __future__ import annotations
 
-from math import sqrt
+from math import cos, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -50,17 +50,18 @@ def described(X_WB: Pose, com_W_mm: Array, cov: Array) -> BodyPose:
     """A pose with its covariance about the centre of mass, and what that means for the attitude angles."""
     euler = matrix_to_euler(X_WB.R)
     angles = np.array(euler[:3])
+    if euler.gimbal_lock:
+        return BodyPose(X_WB, com_W_mm, cov, angles, np.full(3, np.nan))
     jac = _angles_of_turn(angles)
     sd = np.sqrt(np.maximum(np.diag(jac @ cov[:3, :3] @ jac.T), 0.0))
-    return BodyPose(X_WB, com_W_mm, cov, angles, np.full(3, np.nan) if euler.gimbal_lock else sd)
+    return BodyPose(X_WB, com_W_mm, cov, angles, sd)
 
 
 def _angles_of_turn(angles_rad: Array) -> Array:
     """d(alpha, beta, gamma) / d(rotation vector in W), (3, 3): the inverse of the axes about which the angles turn."""
-    _, b, g = angles_rad
-    cb, sb, cg, sg = np.cos(b), np.sin(b), np.cos(g), np.sin(g)
-    axes = np.array([[cg * cb, -sg, 0.0], [sg * cb, cg, 0.0], [-sb, 0.0, 1.0]])
-    return np.linalg.pinv(axes)
+    _, b, g = angles_rad.tolist()
+    cb, sb, cg, sg = cos(b), sin(b), cos(g), sin(g)
+    return np.array([[cg / cb, sg / cb, 0.0], [-sg, cg, 0.0], [cg * sb / cb, sg * sb / cb, 1.0]])
 
 
 def points_from_pose(body: BodyModel, pose: BodyPose) -> tuple[Array, Array]:

@@ -71,22 +71,22 @@ class InertialWatch:
 
     def __init__(self, model: InertialModel, settings: WatchSettings, alarms: Alarms, where: str) -> None:
         self._model, self._s, self._alarms, self._where = model, settings, alarms, where
-        self._last: tuple[float, Array, Array] | None = None
+        self._last: tuple[float, list[float], list[float]] | None = None
         self._usual_s, self._same = 0.0, 0
         self._force_limit = settings.near_range * model.force_range
         self._rate_limit = settings.near_range * model.rate_range
 
     def good(self, t_s: float, force_m_s2: Array, rate_rad_s: Array) -> bool:
         """False for a sample that is frozen, saturated or behind a jump of its clock."""
-        last, self._last = self._last, (t_s, force_m_s2, rate_rad_s)
-        ok = self._in_range(force_m_s2, rate_rad_s)
+        force, rate = force_m_s2.tolist(), rate_rad_s.tolist()
+        last, self._last = self._last, (t_s, force, rate)
+        ok = self._in_range(force, rate)
         if last is None:
             return ok
-        moving = self._moving(last, force_m_s2, rate_rad_s)
+        moving = self._moving(force == last[1] and rate == last[2])
         return self._in_time(t_s - last[0]) and moving and ok
 
-    def _moving(self, last: tuple[float, Array, Array], force: Array, rate: Array) -> bool:
-        same = force[0] == last[1][0] and bool(np.all(force == last[1]) and np.all(rate == last[2]))
+    def _moving(self, same: bool) -> bool:
         self._same = self._same + 1 if same else 0
         if self._same < self._s.same_samples:
             if not same:
@@ -104,8 +104,8 @@ class InertialWatch:
         self._alarms.gone(TimeJumped)
         return True
 
-    def _in_range(self, force: Array, rate: Array) -> bool:
-        f, w = float(np.abs(force).max()), float(np.abs(rate).max())
+    def _in_range(self, force: list[float], rate: list[float]) -> bool:
+        f, w = max(max(force), -min(force)), max(max(rate), -min(rate))
         if not (f < self._force_limit):
             self._alarms.raise_(SensorSaturated(self._where, value=f, limit=self._model.force_range))
             return False

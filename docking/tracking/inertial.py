@@ -40,7 +40,7 @@ class InertialSettings:
     extras: core.Extras = field(default_factory=core.Extras)
     zero_velocity: ZeroVelocity | None = field(default_factory=ZeroVelocity)
     gate: float = 30.0
-    cov_step_s: float = 0.01
+    cov_step_s: float = 0.025
     wait_s: float = 0.02
     history_s: float = 1.0
     blind_force_m_s2: float = 5.0
@@ -108,7 +108,7 @@ class InertialTracker:
         self._alarms = Alarms()
         self._samples_watch = InertialWatch(model, self._s.watch, self._alarms, f"{body.name} inertial sensor")
         self._frames_watch = FrameWatch(body, self._s.watch, self._alarms)
-        self._rest = RestDetector(self._s.zero_velocity) if self._s.zero_velocity else None
+        self._rest = RestDetector(self._s.zero_velocity, model) if self._s.zero_velocity else None
         self._resting, self._tape, self._steps = False, tape, 0
         self._head: _Head | None = None
         self._times: list[float] = []
@@ -287,7 +287,7 @@ class InertialTracker:
             return self._blind(head, t_s, sample)
         force, rate = 0.5 * (last.force + sample.force), 0.5 * (last.rate + sample.rate)
         nav, since = core.integrate(head.nav, head.since, t_s, force, rate)
-        return head._replace(nav=nav, since=since, sample=sample)
+        return _Head(nav, head.cov, since, head.C_before, sample, head.seen, head.used_s)
 
     def _blind(self, head: _Head, t_s: float, sample: Sample | None) -> _Head:
         """No sample is believed: the body goes on as it did, and may do what it wants."""

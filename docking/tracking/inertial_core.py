@@ -94,17 +94,17 @@ NOTHING = Since(0.0, np.zeros(3), np.zeros(3), np.zeros(3))
 
 def integrate(nav: Navigation, since: Since, t_s: float, force: Array, rate: Array) -> tuple[Navigation, Since]:
     """Advance to `t_s` with the interval's mean specific force (mm/s^2) and rate (rad/s), both as measured."""
+    _, p, v, C, force_bias, rate_bias, late, scale, lever = nav
+    summed_s, summed_dv, summed_ds, summed_angle = since
     dt = t_s - nav.t_s
-    angle = ((rate - nav.rate_bias) * dt) * (1.0 + nav.scale)
+    angle = (rate - rate_bias) * (dt * (1.0 + scale))
     x, y, z = angle.tolist()
-    after = nav.C_WI @ turn(x, y, z)
-    dv = ((0.5 * dt) * (nav.C_WI + after)) @ (force - nav.force_bias_mm_s2)
+    after = C @ turn(x, y, z)
+    dv = (C + after) @ ((0.5 * dt) * (force - force_bias))
     gained = dv + G_W_MM_S2 * dt
-    moved = nav._replace(
-        t_s=t_s, p_mm=nav.p_mm + (nav.v_mm_s + 0.5 * gained) * dt, v_mm_s=nav.v_mm_s + gained, C_WI=after
-    )
-    ds = since.ds_mm + (since.dv_mm_s + 0.5 * dv) * dt
-    return moved, Since(since.dt_s + dt, since.dv_mm_s + dv, ds, since.angle_rad + angle)
+    moved = Navigation(t_s, p + (v + 0.5 * gained) * dt, v + gained, after, force_bias, rate_bias, late, scale, lever)
+    ds = summed_ds + (summed_dv + 0.5 * dv) * dt
+    return moved, Since(summed_s + dt, summed_dv + dv, ds, summed_angle + angle)
 
 
 def squared(nav: Navigation) -> Navigation:

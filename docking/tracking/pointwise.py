@@ -21,7 +21,7 @@ ATTITUDE_GAIN = 0.05
 """Share of the attitude that the seen points show which is taken over with every frame; the gyroscope does the rest."""
 SURE_REST_S = 1.0
 """Quiet for so long is rest; an even slow turn may be as quiet for a moment and would be taken for bias."""
-LEVEL_S, REST_LEVEL_GAIN = 60.0, 0.2
+LEVEL_S, REST_LEVEL_GAIN = 300.0, 0.2
 """Where too few points show the attitude: time in which the mean specific force levels it, and the share of the tilt
 that one window of rest takes away."""
 
@@ -51,7 +51,8 @@ class PointwiseTracker:
         self._watch = InertialWatch(model, WatchSettings(), self._alarms, f"{body.name} inertial sensor")
         self._strapdown: Strapdown | None = None
         self._levelled: Integral | None = None
-        self._rest, self._quiet_s = RestDetector(ZeroVelocity()), float("inf")
+        self._rest, self._quiet_s = RestDetector(ZeroVelocity(), model), float("inf")
+        self._waiting: list[Frame] = []
         self._frame_s = float("nan")
         self._used_s = float("nan")
         self._seen = np.zeros(len(body.names), dtype=bool)
@@ -77,6 +78,8 @@ class PointwiseTracker:
         if self._strapdown is None or not good or t_s <= self._strapdown.t_s:
             return
         self._strapdown.sample(t_s, force_m_s2, rate_rad_s)
+        while self._waiting and self._waiting[0].t_s <= t_s:
+            self._take(self._waiting.pop(0))
         quiet = self._rest.sample(t_s, force_m_s2, rate_rad_s)
         if quiet is False or self._quiet_s > t_s:
             self._quiet_s = t_s
@@ -95,7 +98,15 @@ class PointwiseTracker:
         frame = self._framed(t_s, names, xyz_W_mm, cov_mm2)
         if self._strapdown is None:
             self._strapdown = Strapdown(self._first_attitude(frame) @ self.body.X_BI.R)
-        ins = self._strapdown.at(t_s)
+        if t_s > self._strapdown.t_s:
+            self._waiting.append(frame)
+        else:
+            self._take(frame)
+
+    def _take(self, frame: Frame) -> None:
+        """A frame at its turn: the samples have passed it, or are not waited for."""
+        assert self._strapdown is not None
+        t_s, ins = frame.t_s, self._strapdown.at(frame.t_s)
         if ins is None or (t_s <= self._frame_s):
             self.dropped += 1
             return
@@ -164,6 +175,8 @@ class PointwiseTracker:
     # what is asked ---------------------------------------------------------------------------------------------------
     def state(self, t_s: float | None = None) -> TrackedState | None:
         """See `Tracker.state`."""
+        while self._waiting:
+            self._take(self._waiting.pop(0))
         if np.isnan(self._frame_s):
             return None
         assert self._strapdown is not None

@@ -14,15 +14,16 @@ import numpy as np
 from docking.tracking.axis_filters import ThreeStateFilters, drift_noise
 from docking.tracking.pointwise import Frame, PointwiseTracker
 from docking.tracking.strapdown import Integral
-from docking.tracking.types import MM_PER_M, BodyModel, InertialModel, Start
+from docking.tracking.types import GRAVITY_W_MM_S2, MM_PER_M, BodyModel, InertialModel, Start
 from docking.types import Array
 
 
 @dataclass(frozen=True)
 class RepairedSettings:
-    """`bias_density` mm^2/s^5: the bias in W walks, as it turns with the body and stands for its tilt error too."""
+    """`drift_s`: the bias in W walks as it turns with the body and stands for the tilt error too, which the rate noise
+    and a rate bias over so long let grow."""
 
-    bias_density: float = 100.0
+    drift_s: float = 0.1
     velocity_sd_mm_s: float = 100.0
     bias_sd_mm_s2: float = 200.0
 
@@ -48,7 +49,8 @@ class RepairedTracker(PointwiseTracker):
         self._v_mm_s, self._b_mm_s2 = np.zeros_like(self._p_mm), np.zeros_like(self._p_mm)
         cov = np.diag([float(frame.var_mm2.max()), self._s.velocity_sd_mm_s**2, self._s.bias_sd_mm_s2**2])
         density = self._model.force_density * MM_PER_M
-        walk = self._s.bias_density
+        m, g = self._model, float(np.linalg.norm(GRAVITY_W_MM_S2))
+        walk = (m.force_walk * MM_PER_M) ** 2 + g * g * (m.rate_density**2 + self._s.drift_s * m.rate_bias**2)
         self._errors = ThreeStateFilters(np.zeros((3, self._p_mm.size)), cov, lambda dt: drift_noise(dt, density, walk))
 
     def _carried(self, ins: Integral) -> tuple[Array, Array, Array]:

@@ -99,8 +99,8 @@ def play(
         samples.until(t)
         rows = np.flatnonzero(seen[m])
         cov = recording.sigma_mm[m, rows][:, :, None] ** 2 * np.eye(3)
-        samples.past(t)
         tracker.points(t, tuple(names[i] for i in rows), recording.points_W_mm[m, rows], cov)
+        samples.past(t)
         state = tracker.state(t)
         for alarm in tracker.alarms():
             said(alarm)

@@ -1,74 +1,72 @@
 """Is the body at rest? Told from how quiet the inertial sensor is over a short window.
 
-Slow even motion is as quiet as rest: what the detector says is a measurement of zero velocity that must pass the
-filter's gate, never a command.
+Quiet means: no louder than the sensor's own noise. Even motion is as quiet as rest: what the detector says is a
+measurement of zero velocity that must pass the filter's gate, never a command. Where a body creeps evenly, as in
+docking, leave it out.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
+from docking.tracking.types import InertialModel
 from docking.types import Array
+
+_ROOM = 4096
 
 
 @dataclass(frozen=True)
 class ZeroVelocity:
-    """Settings: window, largest sd of force and rate in it (root of the sum over the axes), and the sd of the pseudo
-    measurements of velocity and of the rate that is taken for bias."""
+    """Settings: window, largest sd of force and rate in it as a multiple of the sensor's noise, and the sd of the
+    pseudo measurements of velocity and of the rate that is taken for bias."""
 
     window_s: float = 0.25
-    force_sd_m_s2: float = 0.14
-    rate_sd_rad_s: float = 0.008
+    noise_ratio: float = 1.6
     velocity_sd_mm_s: float = 2.0
     rate_noise_rad_s: float = 0.002
     every_s: float = 0.02
 
 
 class RestDetector:
-    """Running sums over the window; one sample in, one answer out."""
+    """Keeps the samples of the window; one sample in, one answer out."""
 
-    def __init__(self, settings: ZeroVelocity) -> None:
+    def __init__(self, settings: ZeroVelocity, model: InertialModel) -> None:
         self._s = settings
-        self._window: deque[tuple[float, Array]] = deque()
-        self._sum, self._squares = np.zeros(6), np.zeros(6)
-        self._offset: Array | None = None
-        self._next_s = -np.inf
-
-    @property
-    def force_m_s2(self) -> Array:
-        """Mean specific force (3,) over the window."""
-        assert self._offset is not None
-        result: Array = (self._sum / max(len(self._window), 1) + self._offset)[:3]
-        return result
-
-    @property
-    def rate_rad_s(self) -> Array:
-        """Mean rate (3,) over the window."""
-        assert self._offset is not None
-        result: Array = (self._sum / max(len(self._window), 1) + self._offset)[3:]
-        return result
+        self._force = 3.0 * (settings.noise_ratio * model.force_density) ** 2
+        self._rate = 3.0 * (settings.noise_ratio * model.rate_density) ** 2
+        self._rows = np.empty((_ROOM, 7))
+        self._first = self._next = 0
+        self._judge_s = -np.inf
+        self.force_m_s2, self.rate_rad_s = np.zeros(3), np.zeros(3)
+        """Means (3,) over the last judged window."""
 
     def sample(self, t_s: float, force_m_s2: Array, rate_rad_s: Array) -> bool | None:
         """Whether the full window is quiet, judged every `every_s`; None in between."""
-        row = np.concatenate((force_m_s2, rate_rad_s))
-        if self._offset is None:
-            self._offset = row
-        row = row - self._offset  # near zero, so that sums of squares keep their digits
-        self._window.append((t_s, row))
-        self._sum += row
-        self._squares += row * row
-        while self._window[0][0] < t_s - self._s.window_s:
-            _, old = self._window.popleft()
-            self._sum -= old
-            self._squares -= old * old
-        if t_s < self._next_s or t_s - self._window[0][0] < 0.9 * self._s.window_s:
+        if self._next == _ROOM:
+            kept = self._rows[self._first :].copy()
+            self._rows[: len(kept)] = kept
+            self._first, self._next = 0, len(kept)
+        row = self._rows[self._next]
+        row[0], row[1:4], row[4:] = t_s, force_m_s2, rate_rad_s
+        self._next += 1
+        if t_s < self._judge_s:
             return None
-        self._next_s = t_s + self._s.every_s
-        n = len(self._window)
-        mean = self._sum / n
-        var = self._squares / n - mean * mean
-        quiet = var[:3].sum() < self._s.force_sd_m_s2**2 and var[3:].sum() < self._s.rate_sd_rad_s**2
-        return bool(quiet)
+        return self._judged(t_s)
+
+    def _judged(self, t_s: float) -> bool | None:
+        times = self._rows[self._first : self._next, 0]
+        self._first += int(np.searchsorted(times, t_s - self._s.window_s))
+        self._first = max(self._first, self._next - _ROOM // 2)
+        window = self._rows[self._first : self._next]
+        length_s = t_s - float(window[0, 0])
+        self._judge_s = t_s + self._s.every_s
+        if length_s < 0.8 * self._s.window_s or len(window) < 3:
+            return None
+        mean = window[:, 1:].mean(axis=0)
+        off = window[:, 1:] - mean
+        var = np.einsum("ij,ij->j", off, off) / len(window)
+        self.force_m_s2, self.rate_rad_s = mean[:3], mean[3:]
+        per_s = (len(window) - 1) / length_s
+        return bool(var[:3].sum() < self._force * per_s and var[3:].sum() < self._rate * per_s)
