@@ -21,6 +21,8 @@ from docking.types import Array, Fit, Points, Pose, Rejection, Screened
 
 SIGMAS = ("alpha_deg", "beta_deg", "gamma_deg", "x_mm", "y_mm", "z_mm")
 _DOUBTFUL = 1e-3
+_EXPECTED = "as the sigmas let expect"
+_TOO_SMALL = "less than the sigmas let expect: they may be stated too large, and what they hide is not seen"
 _TOO_LARGE = "MORE THAN THE SIGMAS LET EXPECT: noise, locks or nominal are wrong, or the part is not rigid"
 _EMPTY: dict[str, Any] = {
     "pose": None,
@@ -184,8 +186,9 @@ def judgement_lines(result: dict[str, Any]) -> list[str]:
         + " deg"
     ]
     if result["chi2_p"] is not None:
-        verdict = "as the sigmas let expect" if result["chi2_p"] >= _DOUBTFUL else _TOO_LARGE
-        text = f"chi2 {result['chi2']:.1f} for {result['dof']} degrees of freedom (p = {result['chi2_p']:.3g})"
+        p = result["chi2_p"]
+        verdict = _TOO_LARGE if not (p >= _DOUBTFUL) else _TOO_SMALL if p > 1.0 - _DOUBTFUL else _EXPECTED
+        text = f"chi2 {result['chi2']:.1f} for {result['dof']} degrees of freedom (p = {p:.3g})"
         lines.append(f"{text}: {verdict}")
     if result["redundancy"] == 0:
         lines.append("NO REDUNDANCY: three points define a pose, nothing in the fit could prove it wrong")

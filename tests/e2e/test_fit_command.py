@@ -250,6 +250,17 @@ def test_a_refused_fit_has_a_page_too(fitted: Fitted, tmp_path: Path) -> None:
     assert (code, told["error"]["code"]) == (2, 4005)
 
 
+@pytest.mark.parametrize(("noise", "said"), [("iso:0.03", "as the sigmas let"), ("iso:5", "too large")])
+def test_chi_square_is_put_into_words(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], noise: str, said: str
+) -> None:
+    p = pose_from_vector(VECTOR).apply(J) + 0.03 * np.random.default_rng(2).normal(size=J.shape)
+    files = points(tmp_path / "n.csv", J), points(tmp_path / "m.csv", p)
+    call(["fit", *map(str, files), "--noise", noise])
+    out = capsys.readouterr().out
+    assert said in out
+
+
 def test_a_person_is_told_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = points(tmp_path / "n.csv", J), points(tmp_path / "m.csv", seen())
     assert call(["fit", *map(str, files), "--exclude", ",".join(NAMES[3:])]) == 0
