@@ -34,6 +34,8 @@ _MAPPED: Final = {
     0x1A00: tuple(0x6000_0008 | sub << 8 for sub in (1, 2)),
     0x1A01: tuple(0x6401_0010 | sub << 8 for sub in (1, 2, 3, 4)),
 }
+_INPUTS: Final = {0x6000: CONTACTS // 8, 0x6401: ANALOGUE}
+"""Objects that are the inputs themselves, and how many sub-indices of them."""
 _COBS: Final = {0x1800: 0x180, 0x1801: 0x280}
 
 
@@ -50,15 +52,17 @@ class IoDictionary:
 
     def read(self, index: int, sub: int) -> bytes:
         """The object as it travels. Raises Abort."""
-        if index == 0x6000 and sub in (1, 2):
+        if index == 0x6000 and 1 <= sub <= _INPUTS[index]:
             return self._module.contacts()[sub - 1 : sub]
-        if index == 0x6401 and 1 <= sub <= ANALOGUE:
+        if index == 0x6401 and 1 <= sub <= _INPUTS[index]:
             return struct.pack("<h", self._module.counts()[sub - 1])
         entry = self._find(index, sub)
         return entry.value if isinstance(entry.value, bytes) else struct.pack("<" + entry.kind, entry.value)
 
     def write(self, index: int, sub: int, data: bytes) -> None:
         """Store what a master sends. Raises Abort."""
+        if 1 <= sub <= _INPUTS.get(index, 0):
+            raise Abort(READ_ONLY)
         entry = self._find(index, sub)
         if not entry.writable:
             raise Abort(READ_ONLY)
