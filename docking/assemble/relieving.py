@@ -22,6 +22,7 @@ from docking.config.build import plan_period_s, plan_settings, positioners_from,
 from docking.config.load import file_sha256
 from docking.errors import BadArgument
 from docking.journal import JournalFile, read
+from docking.motion.lateness import LATENESS
 from docking.motion.settle import SettleSettings
 from docking.operators import TerminalOperator
 from docking.planning.relief import Tare, Weighing
@@ -107,9 +108,8 @@ async def _relieve(run: _Run, process: MotionProcess, found: dict[str, Any]) -> 
     journal = JournalFile(run.journal_path, loop.time)
 
     def hear(kind: str, body: Any) -> None:
-        journal.write(
-            kind if kind == "lateness" else "motion_process", body if isinstance(body, dict) else {kind: body}
-        )
+        named = kind if kind in LATENESS else "motion_process"
+        journal.write(named, body if isinstance(body, dict) else {kind: body})
         if kind == "hello" and not body["priority"]:
             operator.notify("no_priority")
 

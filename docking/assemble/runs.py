@@ -197,6 +197,9 @@ async def _joined_motion(run: _Run, joined: _Joined, journal: Journal) -> Motion
                 late_ms, limit_mm_s = 1e3 * body["p999_s"], body["speed_limit_mm_s"]
                 run.operator.notify("slowed", late_ms=late_ms, limit_mm_s=limit_mm_s)
             return
+        if kind == "run_lateness":
+            journal.write("run_lateness", body)
+            return
         journal.write("motion_process", body if isinstance(body, dict) else {kind: body})
         if kind == "hello" and not body["priority"]:
             run.operator.notify("no_priority")

@@ -21,6 +21,7 @@ from docking.errors import (
     ProtectiveStop,
 )
 from docking.motion.arbiter import Arbiter, Mode
+from docking.motion.lateness import Lateness
 from docking.motion.served import LocalMotion
 from docking.motion.triggers import Finding, Trigger
 from docking.ports import Inputs
@@ -55,6 +56,10 @@ class GuardedMotion:
     @property
     def arbiter(self) -> Arbiter:
         return self._motion.arbiter
+
+    @property
+    def lateness(self) -> Lateness:
+        return self._motion.lateness
 
     # the port ----------------------------------------------------------------------------------------------------
     async def connect(self) -> tuple[Identity, ...]:

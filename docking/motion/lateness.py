@@ -8,6 +8,8 @@ from typing import Any
 
 from docking.errors import TickLate
 
+LATENESS = ("lateness", "run_lateness")
+"""Messages and records of it: measured before anything is connected, and of all cycles of a run at its end."""
 A_DECADE = 20
 SHORTEST_S = 1e-6
 COUNT = 7 * A_DECADE

@@ -21,6 +21,7 @@ from docking.errors import (
     StoppedByOperator,
 )
 from docking.motion.arbiter import Arbiter, Mode, Reaction
+from docking.motion.lateness import Lateness
 from docking.motion.monitors import Watch
 from docking.motion.playback import Playback
 from docking.motion.queued_move import Phase, QueuedMove
@@ -61,6 +62,11 @@ class QueuedMotion:
         self._keeper: asyncio.Task[None] | None = None
         self._rhythm = Rhythm(poll_s)
         positioners.on_lost = self._rhythm.wake
+
+    @property
+    def lateness(self) -> Lateness:
+        """How late the polls came."""
+        return self._rhythm.lateness
 
     # the port ----------------------------------------------------------------------------------------------------
     async def connect(self) -> tuple[Identity, ...]:

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import asyncio
 
+from docking.motion.lateness import Lateness
+
 GOLDEN, SHARE = 0.618, 0.2
 """During a move polls come up to this share of their period early, spread evenly."""
 
 
 class Rhythm:
-    """Sleeps between the polls of one task, and lets others wait for a poll. Loop time only."""
+    """Sleeps between the polls of one task, and lets others wait for a poll. Loop time only.
+
+    `lateness` counts how late the polls came that nobody woke.
+    """
 
     def __init__(self, poll_s: float) -> None:
         self._poll_s = poll_s
@@ -17,6 +22,7 @@ class Rhythm:
         self._cycled = asyncio.Event()
         self._cycles, self._polled_s, self._phase = 0, 0.0, 0.0
         self.running = False
+        self.lateness = Lateness()
 
     def begin(self) -> None:
         """The first poll is due a period from now."""
@@ -42,12 +48,15 @@ class Rhythm:
         if moving:
             # Never in step with the scans: the phase decides how old the path time is that a read-back shows.
             self._phase = (self._phase + GOLDEN) % 1.0
-        timer = loop.call_at(self._polled_s + self._poll_s * (1.0 - SHARE * self._phase), self.wake)
+        due_s = self._polled_s + self._poll_s * (1.0 - SHARE * self._phase)
+        timer = loop.call_at(due_s, self.wake)
         try:
             await self._sleeper
         finally:
             timer.cancel()
         self._polled_s = loop.time()
+        if self._polled_s >= due_s:
+            self.lateness.add(self._polled_s - due_s)
 
     def cycled(self) -> None:
         """One poll and what follows from it are over."""

@@ -35,6 +35,11 @@ class LocalMotion(Protocol):
         """Decides and keeps what stops the axes."""
         ...
 
+    @property
+    def lateness(self) -> Lateness:
+        """How late its cycles have come so far."""
+        ...
+
     async def connect(self) -> tuple[Identity, ...]: ...
 
     async def enable(self) -> Array: ...
@@ -158,7 +163,9 @@ class ServedMotion:
             await motion.reset(payload)
             self._live = False
             return None
-        return await self._release()
+        await self._release()
+        self._tell_lateness()
+        return None
 
     async def _connect(self) -> tuple[Identity, ...]:
         self._look()
@@ -172,6 +179,11 @@ class ServedMotion:
             limit_mm_s = speed_limit_mm_s(lateness, self._settings.sync_error_mm, self._settings.late_limit_s)
         finally:
             self._send("lateness", 0, {**lateness.as_record(), "speed_limit_mm_s": limit_mm_s})
+
+    def _tell_lateness(self) -> None:
+        """How late the cycles of the whole run came; in virtual time none does."""
+        if self._measure is not None and self._motion.lateness.samples > 0:
+            self._send("run_lateness", 0, self._motion.lateness.as_record())
 
     # what goes out -------------------------------------------------------------------------------------------------
     def _send(self, kind: str, number: int, payload: Any) -> None:

@@ -82,6 +82,8 @@ def view(run: Run, language: str) -> dict[str, Any]:
         "plans": tables.plan_rows(run),
         "blocks": tables.displacement_blocks(moves, axes_of(run)),
         "maxima": tables.maxima_rows(moves, (run.start.get("limits") or {}).get("axis_force_n") or {}),
+        "lateness": tables.lateness_rows(run),
+        "late_ms": tables.LATE_MS,
         "alarms": alarm_rows(run, language),
         "events": tables.event_rows(run, words),
         "head": run.records[-1] if run.records else None,

@@ -7,12 +7,14 @@ import re
 from collections.abc import Iterable
 from typing import Any, Final
 
+from docking.motion.lateness import LATENESS
 from docking.report.run import Body, Move, Record, Run
 from docking.report.words import number, plain
 from docking.types import RISK_LIMIT
 
 Row = dict[str, Any]
 
+LATE_MS: Final = (0.1, 1.0, 10.0, 100.0)
 PLAN_KEYS: Final = ("plan_hash", "stage", "kind", "duration_s", "speed_limited_by", "chord_error_mm")
 
 
@@ -236,6 +238,21 @@ def measurement_rows(run: Run) -> list[Row]:
         }
         for group, readings in groups.items()
     ]
+
+
+def lateness_rows(run: Run) -> list[Row]:
+    """How late the motion process was before the run and in all cycles of it: quantiles in ms, and in how many cycles
+    by less than each of `LATE_MS`, the last by that and more."""
+    rows = []
+    for kind in LATENESS:
+        for body in run.bodies(kind):
+            counts = [0] * (len(LATE_MS) + 1)
+            for upper_s, count in body.get("histogram") or ():
+                # Upper ends of classes: what ends at a bound is under it.
+                counts[sum(1e3 * upper_s > bound * (1.0 + 1e-9) for bound in LATE_MS)] += count
+            quantiles = {f"{key}_ms": 1e3 * numeric(body.get(f"{key}_s")) for key in ("p50", "p99", "p999", "max")}
+            rows.append({"kind": kind, "samples": body.get("samples"), **quantiles, "counts": counts})
+    return rows
 
 
 def plan_rows(run: Run) -> list[Row]:

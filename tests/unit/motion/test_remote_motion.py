@@ -20,7 +20,7 @@ from docking.errors import (
 )
 from docking.motion import StreamedMotion
 from docking.motion.channel import QueueChannel
-from docking.motion.lateness import Lateness, measure_lateness, speed_limit_mm_s
+from docking.motion.lateness import LATENESS, Lateness, measure_lateness, speed_limit_mm_s
 from docking.motion.remote import LeaseSettings, RemoteMotion
 from docking.motion.served import ServedMotion, ServiceSettings
 from sim.virtual_time import run_virtual
@@ -303,3 +303,27 @@ def test_a_fault_is_reset_through_the_channel_by_role_and_edge_and_nothing_is_re
         await bench.motion.close()
 
     play(scenario)
+
+
+def test_how_late_the_cycles_of_a_run_came_is_told_at_its_end():
+    measured = Lateness()
+    measured.add(1e-5)
+
+    async def scenario(bench: Bench) -> None:
+        assert (await (await bench.moving())).result == "done"
+        assert [what for what, _ in bench.told] == ["lateness"]
+        await bench.motion.close()
+
+    bench = play(scenario, measured)
+    assert [what for what, _ in bench.told] == list(LATENESS)
+    told = bench.told[1][1]
+    assert [list(row) for row in told.pop("histogram")] == bench.local.lateness.as_record()["histogram"]
+    assert told == {key: value for key, value in bench.local.lateness.as_record().items() if key != "histogram"}
+    assert told["samples"] >= len(PLAN.q_mm)
+    # Virtual time is never late, and nobody measures it.
+    assert [what for what, _ in play(scenario_without).told] == []
+
+
+async def scenario_without(bench: Bench) -> None:
+    assert (await (await bench.moving())).result == "done"
+    await bench.motion.close()

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from docking.errors import BadArgument, FileUnreadable, catalogue
+from docking.motion.lateness import Lateness
 from docking.report import page as page_module
 from docking.report import summary, write_report
 from docking.report.page import html
@@ -100,6 +101,20 @@ def test_page_is_well_formed_and_needs_nothing_from_elsewhere(docked_page: str) 
     assert "://" not in docked_page
     assert "@import" not in docked_page
     assert not re.search(r"\son\w+=", docked_page)
+
+
+def test_page_tells_how_late_the_cycles_came(tmp_path: Path, no_pictures: None) -> None:
+    run, late = docked_run(), Lateness()
+    for _ in range(1234):
+        late.add(2e-4)
+    run.add("lateness", **late.as_record(), speed_limit_mm_s=99.0)
+    late.add(0.0321)
+    run.add("run_lateness", **late.as_record())
+    text = Page(html(records(run, tmp_path))).text
+    assert "measured at the start 1 234 0.200 0.200 0.200 0.200 0 1 234 0 0 0" in text.replace("\u202f", " ")
+    usual = f"{1e3 * late.quantile_s(0.5):.3f}"
+    assert f"all cycles of the run 1 235 {usual} {usual} {usual} 32.100 0 1 234 0 1 0" in text.replace("\u202f", " ")
+    assert "Punctuality" not in Page(html(records_of(docked_run(), tmp_path / "punctual.jsonl"))).text
 
 
 def test_page_carries_the_numbers_of_the_journal(docked: list[dict[str, Any]], docked_page: str) -> None:
@@ -297,7 +312,7 @@ def test_the_catalogues_have_the_same_words_and_every_word_is_used() -> None:
         assert sorted(re.findall(r"{(\w+)}", english[key])) == sorted(re.findall(r"{(\w+)}", chinese[key])), key
     room = Path(__file__).parents[3] / "docking"
     source = "".join(p.read_text("utf-8") for p in (*room.glob("report/*.py"), room / "templates" / "report.html.j2"))
-    composed = ("outcome_", "said_", "event_", "fit_", "goal_", "before", "after", "final")
+    composed = ("outcome_", "said_", "event_", "fit_", "goal_", "late_", "before", "after", "final")
     assert [key for key in english if not re.search(rf"\b{key}\b", source) and not key.startswith(composed)] == []
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from docking.motion.lateness import Lateness
 from docking.report.figures import inline
 from docking.report.run import Move, Run
 from docking.report.tables import (
@@ -15,6 +16,7 @@ from docking.report.tables import (
     displacement_blocks,
     end_difference,
     feature_rows,
+    lateness_rows,
     maxima_rows,
     natural,
     plan_rows,
@@ -187,3 +189,16 @@ def test_an_inlined_picture_keeps_its_words_and_parts_its_ids() -> None:
         '<svg viewBox="0 0 9 8"><defs><path id="p-m1" d="M 1.23 -0.99"/></defs>'
         '<use href="#p-m1" clip-path="url(#p-m1)"/><text x="1.50">0.0075</text></svg>'
     )
+
+
+def test_lateness_is_counted_in_classes() -> None:
+    """Classes that end at a bound lie under it; what is over the last bound is at the end."""
+    counted = Lateness()
+    for late_s in (5e-6, 5e-5, 5e-4, 5e-3, 0.05, 0.5, 0.6):
+        counted.add(late_s)
+    record = {"kind": "run_lateness", "body": counted.as_record()}
+    (row,) = lateness_rows(Run([record]))
+    assert row["counts"] == [2, 1, 1, 1, 2]
+    assert (row["kind"], row["samples"]) == ("run_lateness", 7)
+    assert row["max_ms"] == pytest.approx(600.0)
+    assert row["p50_ms"] == pytest.approx(5.0, rel=0.13)
