@@ -21,6 +21,7 @@ class Sizes:
     lateness_s: float = 60.0
     epochs: int = 100_000
     tracker_frames: int = 5000
+    can_frames: int = 60_000
 
 
 TINY = Sizes(
@@ -33,6 +34,7 @@ TINY = Sizes(
     lateness_s=0.3,
     epochs=200,
     tracker_frames=50,
+    can_frames=600,
 )
 """Enough to see that everything runs; the ratios mean nothing."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tests.bench import (
+    can_frames,
     fault_reaction,
     modbus_wire,
     planning,
@@ -21,6 +22,7 @@ GROUPS: dict[str, Group] = {
     "P2": pose_fit.measure,
     "P3": planning.measure,
     "P4": stop_replan.measure,
+    "P5": can_frames.measure,
     "P6": modbus_wire.measure,
     "P8": tick_lateness.measure,
     "P9": fault_reaction.measure,
