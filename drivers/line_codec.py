@@ -9,6 +9,7 @@ integers in micrometres and microseconds, so NaN, infinity, exponents and decima
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,6 +62,15 @@ def crc16_arc(data: bytes) -> int:
     for byte in data:
         crc = (crc >> 8) ^ _TABLE[(crc ^ byte) & 0xFF]
     return crc
+
+
+def crcs16_arc(bodies: Sequence[bytes]) -> list[int]:
+    """CRC-16/ARC of each of several data of at most 256 bytes: leading zeros add nothing, so all are padded in front to
+    one length and looked up in one table."""
+    width = max(map(len, bodies), default=0)
+    padded = np.frombuffer(b"".join([body.rjust(width, b"\0") for body in bodies]), dtype=np.uint8)
+    places = padded.reshape(len(bodies), width) + _STARTS[width]
+    return list(map(int, np.bitwise_xor.reduce(_SHARES.take(places), axis=1)))
 
 
 def encode(kind: str, seq: int, *fields: str | int) -> bytes:
@@ -167,9 +177,13 @@ def parse_body(body: str) -> Reply:
     return reply
 
 
+def _framed(line: bytes) -> bool:
+    return len(line) <= LINE_MAX and line[:1] == b"$" and line[-2:] == b"\r\n" and line[-7:-6] == b"*"
+
+
 def parse_line(line: bytes) -> Reply:
     """One whole line, from $ to line feed, checksum verified; ValueError for anything else."""
-    if len(line) > LINE_MAX or line[:1] != b"$" or line[-2:] != b"\r\n" or line[-7:-6] != b"*":
+    if not _framed(line):
         raise ValueError("not framed as a line")
     body = line[1:-7]
     if line[-6:-2] != b"%04X" % crc16_arc(body):
@@ -194,22 +208,37 @@ class LineParser:
         head, *starts = (self._rest + data).split(b"$")
         self.noise += len(head)
         self._rest = b""
-        replies: list[Reply] = []
+        lines: list[bytes] = []
         for index, piece in enumerate(starts):
-            self._take(piece, index == len(starts) - 1, replies)
-        return replies
+            self._cut(piece, index == len(starts) - 1, lines)
+        return self._parsed(lines)
 
-    def _take(self, piece: bytes, is_last: bool, replies: list[Reply]) -> None:
+    def _cut(self, piece: bytes, is_last: bool, lines: list[bytes]) -> None:
         """`piece` is what follows one `$`, up to the next one or to the end of what has arrived."""
         text, newline, after = piece.partition(b"\n")
         if not newline and is_last and len(piece) < LINE_MAX:
             self._rest = b"$" + piece
             return
         self.noise += len(after)
-        try:
-            replies.append(parse_line(b"$" + text + newline))
-        except ValueError:
+        line = b"$" + text + newline
+        if _framed(line):
+            lines.append(line)
+        else:
             self.bad += 1
+
+    def _parsed(self, lines: list[bytes]) -> list[Reply]:
+        """The replies among framed lines; checksums of several are worked out together."""
+        bodies = [line[1:-7] for line in lines]
+        sums = crcs16_arc(bodies) if len(bodies) > 1 else [crc16_arc(body) for body in bodies]
+        replies: list[Reply] = []
+        for line, body, crc in zip(lines, bodies, sums, strict=True):
+            try:
+                if line[-6:-2] != b"%04X" % crc:
+                    raise ValueError("checksum differs")
+                replies.append(parse_body(body.decode("ascii")))
+            except ValueError:
+                self.bad += 1
+        return replies
 
     def reset(self) -> None:
         """Forget the unfinished line; the counts stay."""
