@@ -35,7 +35,7 @@ class Activity(Generic[P]):
         self.motion, self.journal, self.operator = motion, journal, operator
         self.progress = progress
         self._clock = clock
-        self._permissives = Permissives(motion, journal, operator)
+        self.permissives = Permissives(motion, journal, operator)
         self._devices: tuple[Device, ...] = ()
 
     def alarm(self, error: DockingError) -> None:

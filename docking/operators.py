@@ -52,6 +52,9 @@ class AutomaticOperator:
     async def blocked(self, error: DockingError, *, retreatable: bool) -> Event | None:
         return None
 
+    async def how_far(self, places: tuple[str, ...]) -> int:
+        return 1
+
     async def hold_to_run(self, facts: dict[str, Any]) -> bool:
         return False
 
@@ -175,6 +178,15 @@ class TerminalOperator:
         word = await self._ask(_AGAIN | _RETREAT, "again_or_retreat")
         return Event.RETREAT if word in _RETREAT else Event.AGAIN
 
+    async def how_far(self, places: tuple[str, ...]) -> int:
+        """Wait for a number of moves, `all`, or the name of the place to go back to: the nearest of that name."""
+        listed = ", ".join(f"{number} = {place}" for number, place in enumerate(places, 1))
+        numbers = {str(number): number for number in range(1, len(places) + 1)}
+        names = {place.lower(): number for number, place in reversed(list(enumerate(places, 1)))}
+        choices = {**names, **dict.fromkeys(_ALL, len(places)), **numbers}
+        expected = frozenset(choices)
+        return choices[await self._ask(expected, "how_far", places=listed)]
+
     async def hold_to_run(self, facts: dict[str, Any]) -> bool:
         """Wait for the one key that asks for one step; any other answer, and none in time, lets go."""
         try:
@@ -211,5 +223,6 @@ _YES = frozenset({"y", "yes", "是"})
 _NO = frozenset({"n", "no", "否"})
 _AGAIN = frozenset({"m", "measure", "测量"})
 _RETREAT = frozenset({"r", "retreat", "退回"})
+_ALL = frozenset({"all", "全部"})
 _STEP = frozenset({"s", "step", "一步"})
 _PERCENT = re.compile(r"(\d{1,3}(?:\.\d)?) ?[%％]")

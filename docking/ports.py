@@ -289,6 +289,10 @@ class Operator(Protocol):
         to decide: then the error stands."""
         ...
 
+    async def how_far(self, places: tuple[str, ...]) -> int:
+        """How many moves a retreat goes back, 1 to len(places); `places` says where one, two ... moves lead."""
+        ...
+
     async def hold_to_run(self, facts: dict[str, Any]) -> bool:
         """Whether a supervisor asks for the next relief step, now: False on anything else and when the time is up."""
         ...

@@ -15,6 +15,7 @@ from docking.config.build import load_from, plan_period_s, plan_settings, positi
 from docking.config.cell import CellFile, ModbusBus
 from docking.config.job import JobFile, Stage
 from docking.config.load import default_job_path, load_cell, load_job
+from docking.config.raising import raising_from
 from docking.errors import BadArgument
 from docking.geometry import pose_from_vector, pose_to_vector
 from docking.kinematics import Positioners, axis_positions, ball_reactions_n, sink_mm
@@ -27,7 +28,7 @@ from docking.planning import (
     moved_pose,
 )
 from docking.planning.jam import JamBound, jam_bound
-from docking.types import Array, Plan, Pose
+from docking.types import Array, Correction, Plan, Pose
 
 SHIFT_SHARE, TURN_SHARE = 0.4, 0.25
 """A drawn start is off by up to these shares of the largest first correction."""
@@ -54,19 +55,19 @@ class Preview:
         self._docked = docked_pose(cell, job)
         self._mate = pose_from_vector(job.mate.pose)
         self._face_C = self.settings.mate.face_C_mm
+        self._raising = raising_from(cell, job)
 
     def moves(self) -> Iterator[StageMove]:
         """Plan stage after stage, each from where the one before ends. Raises what the planner refuses."""
         here = self._start()
         q_mm = self._axes_at(here)
         before_mm = float("inf")
-        for number, stage in enumerate(self.job.stages, start=1):
-            goal = self._station(stage.standoff_mm)
-            correction = correction_to(here, goal, self._face_C)
+        for number, (kind, stage) in enumerate(self._waypoints(), start=1):
+            correction = self._correction(kind, here, stage)
             request = PlanRequest(
                 plan_id=number,
                 stage=stage.name,
-                kind="align" if number == 1 else "approach",
+                kind=kind,
                 q_now_mm=q_mm,
                 correction=correction,
                 speed_mm_s=stage.speed_mm_s,
@@ -76,7 +77,23 @@ class Preview:
             )
             plan = make_plan(request, self.positioners, self.settings)
             yield StageMove(stage, plan, self._jam(plan))
-            here, q_mm, before_mm = moved_pose(here, correction), plan.q_mm[-1], stage.standoff_mm
+            here, q_mm = moved_pose(here, correction), plan.q_mm[-1]
+            before_mm = before_mm if kind in ("lift", "level") else stage.standoff_mm
+
+    def _waypoints(self) -> Iterator[tuple[str, Stage]]:
+        """Kind and stage of every move; lift and levelling happen at the first station's stand-off."""
+        first, asked = self.job.stages[0], {"lift": self.job.lift_mm > 0.0, "level": self.job.level}
+        for kind in (kind for kind, wanted in asked.items() if wanted):
+            yield kind, first.model_copy(update={"name": kind, "speed_mm_s": self.job.lift_speed_mm_s})
+        for stage in self.job.stages:
+            yield "align" if stage is first else "approach", stage
+
+    def _correction(self, kind: str, here: Pose, stage: Stage) -> Correction:
+        if kind == "lift":
+            return self._raising.lift(here)
+        if kind == "level":
+            return self._raising.levelling(here)
+        return correction_to(here, self._station(stage.standoff_mm), self._face_C)
 
     def _jam(self, plan: Plan) -> JamBound:
         return jam_bound(self.positioners, plan.q_mm[[0, -1]], self.settings.jam, self.settings.load.up)
@@ -86,10 +103,11 @@ class Preview:
         return Pose(self._docked.R, self._docked.t_mm - standoff_mm * axis_W)
 
     def _start(self) -> Pose:
-        """The first station, turned about its docking face and shifted."""
+        """The first station, turned about its docking face and shifted, and lower by the lift."""
         first, by = self._station(self.job.stages[0].standoff_mm), pose_from_vector(self.offset)
         face = first.apply(self._face_C)
-        return Pose(by.R @ first.R, face + by.R @ (first.t_mm - face) + by.t_mm)
+        lift_mm = self._raising.lift_mm * self._raising.up_W
+        return Pose(by.R @ first.R, face + by.R @ (first.t_mm - face) + by.t_mm - lift_mm)
 
     def _axes_at(self, X_WC: Pose) -> Array:
         """Where the loaded axes stand with the component at X_WC: as `docking check` counts the strokes."""

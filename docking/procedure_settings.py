@@ -10,6 +10,8 @@ from docking.approach import Approach
 from docking.kinematics import Positioners
 from docking.motion.settle import SettleSettings
 from docking.planning import GuardSettings, PlanSettings
+from docking.planning.raising import Raising
+from docking.planning.relief import LoadCellErrors
 from docking.survey import Nominals, SurveySettings
 from docking.types import InputState, Pose
 
@@ -18,7 +20,9 @@ from docking.types import InputState, Pose
 class ProcedureSettings:
     """What the procedure needs of the files, besides the stages' own settings.
 
-    `enabling` are the devices that a person holds in every move; `measured` says what the inputs change.
+    `enabling` are the devices that a person holds in every move; `measured` says what the inputs change; `cells` what
+    the load cells may be wrong by; `warp_limit_n` of the lifted part; no ball's force may rise by more than
+    `retreat_rise_n` on the way back.
     """
 
     positioners: Positioners
@@ -34,6 +38,10 @@ class ProcedureSettings:
     rms_limit_mm: float | None
     plausibility_mm: float
     fit_age_s: float
+    raising: Raising
+    cells: LoadCellErrors
+    warp_limit_n: float
+    retreat_rise_n: float
     enabling: tuple[str, ...] = ()
     measured: Callable[[InputState], Measured | None] = lambda state: None
 

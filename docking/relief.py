@@ -140,7 +140,7 @@ class Relief(Activity[ReliefProgress]):
         raise NotRelieved("part", cause, value=strain.largest_n, limit=relief.target_n)
 
     async def _declare(self) -> None:
-        await self._permissives.require(self.run.permissives, "relief")
+        await self.permissives.require(self.run.permissives, "relief")
 
     def _next_plan(self, scales: Scales, strain: Strain, weighing: Weighing) -> Plan:
         run, p = self.run, self.progress

@@ -25,12 +25,13 @@ class State(Enum):
     MEASURE_FRAME = "measure-frame"
     BALL_ENTRY = "ball-entry"
     LOCK_BALLS = "lock-balls"
-    LIFT = "lift"
-    LEVEL = "level"
     MEASURE = "measure"
     BLOCKED = "blocked"
     FIT = "fit"
     VERIFY = "verify"
+    LIFT = "lift"
+    TAKE_LOAD = "take-load"
+    LEVEL = "level"
     PLAN = "plan"
     CONFIRM = "confirm"
     RETREAT = "retreat"
@@ -63,13 +64,13 @@ class Event(Enum):
     FRAME_MEASURED_EMPTY = "frame-measured-empty"
     BALLS_ENTERED = "balls-entered"
     BALLS_LOCKED = "balls-locked"
-    LOAD_TAKEN = "load-taken"
-    LEVELLED = "levelled"
     MEASURED = "measured"
     UNSEEN = "unseen"
     AGAIN = "again"
     RETREAT = "retreat"
     FITTED = "fitted"
+    LIFT_NEEDED = "lift-needed"
+    LEVEL_NEEDED = "level-needed"
     MOVE_NEEDED = "move-needed"
     MEASURE_MORE = "measure-more"
     ACCEPTED = "accepted"
@@ -84,6 +85,8 @@ class Event(Enum):
     ABORT = "abort"
     STOPPED = "stopped"
     SETTLED = "settled"
+    LIFTED = "lifted"
+    LOAD_TAKEN = "load-taken"
     START_RELIEF = "start-relief"
     STEP_ASKED = "step-asked"
     RELEASED = "released"
@@ -102,15 +105,17 @@ class Effect(Enum):
     LOCATE = "locate station and mate"
     ENTER_BALLS = "bring the sockets under the balls"
     LOCK_BALLS = "lock the balls"
-    TAKE_LOAD = "take the load"
-    LEVEL = "level"
     MEASURE = "measure the component"
     FIT = "fit the pose"
     JUDGE = "compare with the stage's goal"
+    LIFT = "plan the lift"
+    TAKE_LOAD = "weigh the lifted part and compare it with the job"
+    LEVEL = "plan the levelling"
     PLAN = "plan and check the move"
     OFFER = "ask whether to measure again or to retreat"
     PLAN_RETREAT = "plan the way back"
     ASK = "show the plan and ask"
+    ASK_BACK = "show the way back and ask once for all of it"
     MOVE = "run the plan"
     HOLD = "hold on the path"
     RESUME = "go on along the path"
@@ -151,9 +156,7 @@ TABLE: dict[tuple[State, Event], Transition] = {
     (S.HOMED, E.MEASURE_FRAME): Transition(S.MEASURE_FRAME, (F.LOCATE,)),
     (S.MEASURE_FRAME, E.FRAME_MEASURED_EMPTY): Transition(S.BALL_ENTRY, (F.ENTER_BALLS,)),
     (S.BALL_ENTRY, E.BALLS_ENTERED): Transition(S.LOCK_BALLS, (F.LOCK_BALLS,)),
-    (S.LOCK_BALLS, E.BALLS_LOCKED): Transition(S.LIFT, (F.TAKE_LOAD,)),
-    (S.LIFT, E.LOAD_TAKEN): Transition(S.LEVEL, (F.LEVEL,)),
-    (S.LEVEL, E.LEVELLED): Transition(S.MEASURE, (F.MEASURE,)),
+    (S.LOCK_BALLS, E.BALLS_LOCKED): Transition(S.MEASURE, (F.MEASURE,)),
     (S.MEASURE_FRAME, E.FRAME_MEASURED): Transition(S.MEASURE, (F.MEASURE,)),
     (S.MEASURE, E.MEASURED): Transition(S.FIT, (F.FIT,)),
     (S.MEASURE, E.UNSEEN): Transition(S.BLOCKED, (F.OFFER,)),
@@ -162,16 +165,20 @@ TABLE: dict[tuple[State, Event], Transition] = {
     (S.BLOCKED, E.RETREAT): Transition(S.RETREAT, (F.PLAN_RETREAT,)),
     (S.FIT, E.FITTED): Transition(S.VERIFY, (F.JUDGE,)),
     (S.FIT, E.MEASURE_MORE): Transition(S.MEASURE, (F.MEASURE,)),
+    (S.VERIFY, E.LIFT_NEEDED): Transition(S.LIFT, (F.LIFT,)),
+    (S.VERIFY, E.LEVEL_NEEDED): Transition(S.LEVEL, (F.LEVEL,)),
     (S.VERIFY, E.MOVE_NEEDED): Transition(S.PLAN, (F.PLAN,)),
     (S.VERIFY, E.MEASURE_MORE): Transition(S.MEASURE, (F.MEASURE,)),
     (S.VERIFY, E.ACCEPTED): Transition(S.DOCKED),
     (S.VERIFY, E.NOT_ACCEPTED): Transition(S.OUT_OF_TOLERANCE),
+    (S.LIFT, E.PLANNED): Transition(S.CONFIRM, (F.ASK,)),
+    (S.LEVEL, E.PLANNED): Transition(S.CONFIRM, (F.ASK,)),
     (S.PLAN, E.PLANNED): Transition(S.CONFIRM, (F.ASK,)),
     (S.CONFIRM, E.CONFIRMED): Transition(S.MOVE, (F.MOVE,)),
     (S.CONFIRM, E.DECLINED): Transition(S.RECOVER),
     (S.CONFIRM, E.STALE): Transition(S.MEASURE, (F.MEASURE,)),
     (S.CONFIRM, E.RETREAT): Transition(S.RETREAT, (F.PLAN_RETREAT,)),
-    (S.RETREAT, E.PLANNED): Transition(S.CONFIRM_RETREAT, (F.ASK,)),
+    (S.RETREAT, E.PLANNED): Transition(S.CONFIRM_RETREAT, (F.ASK_BACK,)),
     (S.CONFIRM_RETREAT, E.CONFIRMED): Transition(S.MOVE, (F.MOVE,)),
     (S.CONFIRM_RETREAT, E.DECLINED): Transition(S.RECOVER),
     (S.MOVE, E.HOLD): Transition(S.PAUSED, (F.HOLD,)),
@@ -183,6 +190,9 @@ TABLE: dict[tuple[State, Event], Transition] = {
     (S.STOPPING, E.STOPPED): Transition(S.RECOVER),
     (S.STOPPING, E.MOVED): Transition(S.RECOVER),
     (S.SETTLE, E.SETTLED): Transition(S.MEASURE, (F.MEASURE,)),
+    (S.SETTLE, E.LIFTED): Transition(S.TAKE_LOAD, (F.TAKE_LOAD,)),
+    (S.SETTLE, E.RETREAT): Transition(S.RETREAT, (F.PLAN_RETREAT,)),
+    (S.TAKE_LOAD, E.LOAD_TAKEN): Transition(S.MEASURE, (F.MEASURE,)),
     (S.IDLE, E.START_RELIEF): Transition(S.RELIEVE, (F.WEIGH,)),
     (S.RELIEVE, E.STEP_ASKED): Transition(S.RELIEF_STEP, (F.STEP,)),
     (S.RELIEVE, E.RELEASED): Transition(S.RECOVER),
@@ -200,7 +210,7 @@ TABLE: dict[tuple[State, Event], Transition] = {
 AT_REST = frozenset(
     {
         *(S.STANDBY, S.DISABLED, S.IDLE, S.MEASURE_FRAME, S.MEASURE, S.BLOCKED, S.FIT, S.VERIFY, S.PLAN, S.CONFIRM),
-        *(S.RETREAT, S.CONFIRM_RETREAT, S.SETTLE, S.RELIEVE),
+        *(S.LIFT, S.TAKE_LOAD, S.LEVEL, S.RETREAT, S.CONFIRM_RETREAT, S.SETTLE, S.RELIEVE),
     }
 )
 """States with nothing moving, from which the operator can leave at once."""

@@ -122,6 +122,15 @@ class Survey:
             more = False
             await self.locate(self._station(), X_WM_guess)
 
+    async def see_references(self, X_WM_guess: Pose) -> None:
+        """Look at the references alone; where station or mate have moved, locate both anew. Raises as `locate`, and
+        TooFewPoints where too few references are seen."""
+        try:
+            await self._check_references()
+        except StationMoved as moved:
+            self._note_moved(moved)
+            await self.locate(self._station(), X_WM_guess)
+
     async def _measure_features(self, X_WC_guess: Pose, passes: int) -> tuple[Points, Points]:
         """Features of the component and of the mate, twice as often as targets: once confirmed, never again."""
         X_WM = self.X_WM.X_MN if self.X_WM is not None else Pose.identity()

@@ -4,8 +4,8 @@ Mathematics of its own (NumPy and SciPy): nothing of `docking.geometry`, `pose` 
 error there cannot cancel itself here.
 
 Start of a run: the component hangs at the first stage's stand-off with the misalignment of the truth file (turned about
-its own origin), balls locked, load taken. Each socket stands exactly under its ball, sunk by the reaction that
-equilibrium needs and no more: the component starts free of internal force.
+its own origin), lower by what the job lifts it first, balls locked, load taken. Each socket stands exactly under its
+ball, sunk by the reaction that equilibrium needs and no more: the component starts free of internal force.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Plant:
         self._weight_n: Array = self._component.mass_kg * GRAVITY_M_S2 * self._down
         self._supports, down_signs = true_supports(cell, truth, draws)
         axis_truth = true_axes(cell, truth, draws, down_signs)
-        self._equilibrium = Equilibrium(self._supports, _start_body(job, mate_pose, truth, draws))
+        self._equilibrium = Equilibrium(self._supports, _start_body(job, mate_pose, truth, draws, self._down))
         sockets, self._start_fore = self._seat(truth, draws)
         self._bank = AxisBank(axis_truth, sockets, self._carries)
         _check_strokes(self.axes, self._bank.motor_mm, axis_truth.stroke_mm)
@@ -329,15 +329,15 @@ class Plant:
         self._names = names
 
 
-def _start_body(job: JobFile, mate: Pose, truth: TruthFile, draws: Draws) -> Body:
-    """The component at the first stage's stand-off, misaligned about its own origin."""
+def _start_body(job: JobFile, mate: Pose, truth: TruthFile, draws: Draws, down: Array) -> Body:
+    """The component at the first stage's stand-off, misaligned about its own origin, before any lift."""
     goal = docked_pose(job, mate)
     axis = mate.R @ np.array(job.docking_axis)
     shift = draws.uniform("misalignment", (3,)) * truth.misalignment.mm
     angles = draws.uniform("misalignment", (3,)) * truth.misalignment.deg
     turn = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
     standoff = job.stages[0].standoff_mm * axis / np.linalg.norm(axis)
-    return Body(turn @ goal.R, goal.t_mm - standoff + shift)
+    return Body(turn @ goal.R, goal.t_mm - standoff + shift + job.lift_mm * down)
 
 
 def _check_strokes(axes: tuple[str, ...], motor_mm: Array, stroke_mm: Array) -> None:

@@ -19,6 +19,7 @@ from docking.config.build import (
     plan_period_s,
     plan_settings,
     positioners_from,
+    relief_settings,
 )
 from docking.config.cell import ModbusBus
 from docking.config.nominal import (
@@ -29,6 +30,7 @@ from docking.config.nominal import (
     measured_features,
     target_points,
 )
+from docking.config.raising import raising_from
 from docking.config.temperatures import part_temperatures, with_temperatures
 from docking.geometry import pose_from_vector
 from docking.kinematics import Positioners
@@ -46,6 +48,10 @@ __all__ = ["Company", "Wires", "build_cell"]
 
 AGREEING_POINTS = 4
 """Points that must agree before the cell believes a fit: three have nothing left to prove them wrong."""
+
+
+RETREAT_RISE = 0.75
+"""How far a ball's force may rise on the way back, as a share of the internal force that stops any other move."""
 
 
 @dataclass(frozen=True)
@@ -141,6 +147,10 @@ def _procedure_settings(cell: CellFile, job: JobFile, positioners: Positioners) 
         rms_limit_mm=job.rms_limit_mm,
         plausibility_mm=limits.frame_plausibility_mm,
         fit_age_s=limits.fit_age_s,
+        raising=raising_from(cell, job),
+        cells=relief_settings(cell).cells,
+        warp_limit_n=limits.measured_whole_warp_n,
+        retreat_rise_n=RETREAT_RISE * limits.measured_force_n,
         measured=lambda state: _measured(cell, job, state),
     )
 

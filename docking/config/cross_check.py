@@ -15,6 +15,7 @@ from docking.config.findings import Finding, error, errors_of, warning
 from docking.config.input_checks import input_findings
 from docking.config.job import JobFile, Target
 from docking.config.nominal import docked_in_mate, feature_points, mate_feature_points
+from docking.config.raising import lift_findings
 from docking.config.support import (
     follower_findings,
     rank_findings,
@@ -60,6 +61,7 @@ def check_job(cell: CellFile, job: JobFile, *, proof: bool = True) -> list[Findi
     if not errors_of(findings):
         findings += _computed("component.com_mm", lambda: reaction_findings(cell, job))
         findings += _computed("stages", lambda: stroke_findings(cell, job) + speed_findings(cell, job))
+        findings += _computed("lift_mm", lambda: lift_findings(cell, job))
         findings += _computed("component.features", lambda: _provable(cell, job)) if proof else []
     return findings
 

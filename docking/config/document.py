@@ -234,7 +234,7 @@ def _start(doc: Document) -> list[Finding]:
     return [
         error(
             "start",
-            "'empty' is refused: homing and ball entry are not performed by this version; seat the part with the "
-            'positioners\' own controls and use start = "seated"',
+            "'empty' is refused: a docking does not begin with homing and ball entry; home free axes with `docking "
+            'home`, seat the part and lock the balls with the positioners\' own controls, and use start = "seated"',
         )
     ]

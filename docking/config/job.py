@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from docking.config.base import Finite, Model, Name, NonNegative, PoseVector, Positive, Vector3
+from docking.config.instructions import Instruction
 from docking.pose.goal import GoalKind, Lock
 
 
@@ -109,7 +110,19 @@ class JobFile(Model):
     part_number: Annotated[str, Field(min_length=1, max_length=64)] = Field(description="of the component")
     serial_number: Annotated[str, Field(min_length=1, max_length=64)] = Field(description="of the component")
     start: Literal["seated", "empty"] = Field(
-        description="seated: balls locked and load taken; empty: begin with homing"
+        description="seated: the part is on its balls and they are locked; empty is refused: a docking does not begin "
+        "with homing and ball entry"
+    )
+    lift_mm: NonNegative = Field(
+        default=0.0,
+        description="how far the part is lifted first, straight up against gravity, and then weighed, mm; 0: no lift",
+    )
+    level: bool = Field(
+        default=False,
+        description="whether the part is brought level before it is aligned: as level as in its docked pose by design",
+    )
+    lift_speed_mm_s: Positive = Field(
+        default=5.0, description="asked for lift and levelling, mm/s; the plan may be slower"
     )
     component: Component = Field(description="the part that moves")
     mate: Mate = Field(description="the part that stands")
@@ -134,6 +147,9 @@ class JobFile(Model):
     measuring: Measuring = Field(default=Measuring(), description="how often points are measured")
     rms_limit_mm: Positive | None = Field(
         default=None, description="largest rms of a fit, mm; by default from the sigmas"
+    )
+    instructions: tuple[Instruction, ...] = Field(
+        default=(), description="what persons do, drawn at its place by `docking guide overlay`"
     )
 
     @property

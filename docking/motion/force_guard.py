@@ -18,17 +18,22 @@ READINGS, PAUSE_S = 2, 0.02
 
 @dataclass(frozen=True, eq=False)
 class ForceGuard:
-    """`before_n` (k,) force at each ball before the move, `limit_n` (k,) how far each may rise over it."""
+    """`before_n` (k,) size of the force at each ball before the move, `limit_n` (k,) how far each may rise over it.
+
+    Where `zero_n` (m,) is given, forces along the axes count from there on.
+    """
 
     positioners: Positioners
     before_n: Array
     limit_n: Array
+    zero_n: Array | None = None
 
     @classmethod
-    def of_readings(cls, positioners: Positioners, force_n: Array, limit_n: float) -> ForceGuard:
-        """Against axis forces `force_n` (m,) read at rest, the same limit at every ball."""
-        before = ball_forces_n(positioners, force_n)
-        return cls(positioners, before, np.full(len(before), limit_n))
+    def of_change(cls, positioners: Positioners, force_n: Array, limit_n: float) -> ForceGuard:
+        """What pushes or pulls from any side counts: the change of each ball's force against axis forces (m,) read at
+        rest."""
+        balls = len(positioners.names)
+        return cls(positioners, np.zeros(balls), np.full(balls, limit_n), force_n)
 
     def check(self, force_n: Array) -> None:
         """Raise ForceRose for ball forces (k,) that rose too far, or are no numbers."""
@@ -59,7 +64,9 @@ class ForceGuard:
             try:
                 latest = [*latest[1 - READINGS :], motion.feedback().force_n]
                 if len(latest) == READINGS:
-                    self.check(ball_forces_n(self.positioners, np.mean(latest, axis=0)))
+                    force_n = np.mean(latest, axis=0)
+                    force_n = force_n if self.zero_n is None else force_n - self.zero_n
+                    self.check(ball_forces_n(self.positioners, force_n))
             except DockingError:
                 motion.request("stop")
                 raise

@@ -20,11 +20,17 @@ class Person(AutomaticOperator):
         super().__init__(say)
         self._blocked, self._confirm, self.asked = blocked, confirm, 0
         self.retreatable: list[bool] = []
+        self.places: list[tuple[str, ...]] = []
+        self.moves = 1
         self.offered: list[bool] = []
 
     async def blocked(self, error, *, retreatable: bool) -> Event:
         self.retreatable.append(retreatable)
         return self._blocked.pop(0)
+
+    async def how_far(self, places: tuple[str, ...]) -> int:
+        self.places.append(places)
+        return self.moves
 
     async def confirm(self, plan, shown: dict[str, Any]) -> Event:
         self.asked += 1

@@ -102,7 +102,7 @@ def test_letting_the_enabling_device_go_stops_a_move_that_a_person_asked_for(ste
     def scenario(run: DryCell) -> None:
         procedure = run.controller.procedure
         if step:
-            procedure._settings = dataclasses.replace(procedure._settings, enabling=("enabling",))
+            procedure.known.settings = dataclasses.replace(procedure.known.settings, enabling=("enabling",))
         run.on_move(lambda plan: run.loop.call_later(0.5 * plan.duration_s, run.far.world.hold, "enabling", False))
 
     cell = run_dry("lab-can", 1, tmp_path, scenario)

@@ -40,9 +40,9 @@ QUIET_S = 3.0
 
 
 @cache
-def files(name: str) -> tuple[CellFile, JobFile]:
+def files(name: str, job: str | None = None) -> tuple[CellFile, JobFile]:
     cell = load_cell(CELLS / f"{name}.toml")
-    return cell, load_job(CELLS / f"{name}.job.toml", cell)
+    return cell, load_job(CELLS / f"{job or name}.job.toml", cell)
 
 
 class Tap:
@@ -62,11 +62,12 @@ class Tap:
 
 
 class DryCell:
-    """One docking of the reference cell `name`; make it on the loop that runs it. `say` collects what is told."""
+    """One docking of the reference cell `name`, with its own job or another by name; make it on the loop that runs it.
+    `said` collects what is told."""
 
-    def __init__(self, name: str, seed: int, journal: Path) -> None:
+    def __init__(self, name: str, seed: int, journal: Path, job: str | None = None) -> None:
         self.loop = asyncio.get_running_loop()
-        self.cell, self.job = files(name)
+        self.cell, self.job = files(name, job)
         self.positioners = positioners_from(self.cell, self.job)
         self.far: FarEnd = make_far_end(self.cell, self.job, truth_of(CELLS / f"{name}.toml"), seed)
         self.serial = VirtualSerial(self.loop, self.cell.tracker.baud)
@@ -204,11 +205,11 @@ class DryCell:
         return rigid_gap_mm(sockets_mm(*where, plan.q_mm[0])[0], sockets_mm(*where, q_mm))
 
 
-def run_dry(name: str, seed: int, folder: Path, scenario: Callable[[DryCell], None]) -> DryCell:
+def run_dry(name: str, seed: int, folder: Path, scenario: Callable[[DryCell], None], job: str | None = None) -> DryCell:
     """Dock once; `scenario` sets its traps before anything happens. Whatever went wrong inside is raised here."""
 
     async def main() -> DryCell:
-        run = DryCell(name, seed, folder / f"{name}-{seed}.jsonl")
+        run = DryCell(name, seed, folder / f"{name}-{seed}.jsonl", job)
         await run.build()
         scenario(run)
         await run.dock()

@@ -19,6 +19,7 @@ ANSWERS = {
     Effect.FIT: Event.FITTED,
     Effect.PLAN: Event.PLANNED,
     Effect.ASK: Event.CONFIRMED,
+    Effect.ASK_BACK: Event.CONFIRMED,
     Effect.MOVE: Event.MOVED,
     Effect.SETTLE: Event.SETTLED,
 }

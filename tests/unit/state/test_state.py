@@ -30,9 +30,7 @@ MEASURE_FRAME     FRAME_MEASURED       MEASURE           MEASURE
 MEASURE_FRAME     FRAME_MEASURED_EMPTY BALL_ENTRY        ENTER_BALLS
 MEASURE_FRAME     ABORT                RECOVER
 BALL_ENTRY        BALLS_ENTERED        LOCK_BALLS        LOCK_BALLS
-LOCK_BALLS        BALLS_LOCKED         LIFT              TAKE_LOAD
-LIFT              LOAD_TAKEN           LEVEL             LEVEL
-LEVEL             LEVELLED             MEASURE           MEASURE
+LOCK_BALLS        BALLS_LOCKED         MEASURE           MEASURE
 MEASURE           MEASURED             FIT               FIT
 MEASURE           UNSEEN               BLOCKED           OFFER
 MEASURE           ABORT                RECOVER
@@ -43,7 +41,15 @@ FIT               UNSEEN               BLOCKED           OFFER
 FIT               FITTED               VERIFY            JUDGE
 FIT               MEASURE_MORE         MEASURE           MEASURE
 FIT               ABORT                RECOVER
+VERIFY            LIFT_NEEDED          LIFT              LIFT
+VERIFY            LEVEL_NEEDED         LEVEL             LEVEL
 VERIFY            MOVE_NEEDED          PLAN              PLAN
+LIFT              PLANNED              CONFIRM           ASK
+LIFT              ABORT                RECOVER
+LEVEL             PLANNED              CONFIRM           ASK
+LEVEL             ABORT                RECOVER
+TAKE_LOAD         LOAD_TAKEN           MEASURE           MEASURE
+TAKE_LOAD         ABORT                RECOVER
 VERIFY            MEASURE_MORE         MEASURE           MEASURE
 VERIFY            ACCEPTED             DOCKED
 VERIFY            NOT_ACCEPTED         OUT_OF_TOLERANCE
@@ -55,7 +61,7 @@ CONFIRM           DECLINED             RECOVER
 CONFIRM           STALE                MEASURE           MEASURE
 CONFIRM           RETREAT              RETREAT           PLAN_RETREAT
 CONFIRM           ABORT                RECOVER
-RETREAT           PLANNED              CONFIRM_RETREAT   ASK
+RETREAT           PLANNED              CONFIRM_RETREAT   ASK_BACK
 RETREAT           ABORT                RECOVER
 CONFIRM_RETREAT   CONFIRMED            MOVE              MOVE
 CONFIRM_RETREAT   DECLINED             RECOVER
@@ -69,6 +75,8 @@ PAUSED            ABORT                STOPPING          STOP
 STOPPING          STOPPED              RECOVER
 STOPPING          MOVED                RECOVER
 SETTLE            SETTLED              MEASURE           MEASURE
+SETTLE            LIFTED               TAKE_LOAD         TAKE_LOAD
+SETTLE            RETREAT              RETREAT           PLAN_RETREAT
 SETTLE            ABORT                RECOVER
 IDLE              START_RELIEF         RELIEVE           WEIGH
 RELIEVE           STEP_ASKED           RELIEF_STEP       STEP
@@ -167,7 +175,22 @@ def test_a_second_move_needs_all_four_again(missing):
     assert State.MOVE not in {s.state for s in reachable(settled, without={missing, E.RETREAT})}
 
 
-def test_a_retreat_leads_back_to_a_measurement_and_nowhere_else():
+def test_a_lift_is_planned_confirmed_and_weighed_before_anything_else_moves():
+    lifted = after(*TO_FIT, E.FITTED, E.LIFT_NEEDED, E.PLANNED, E.CONFIRMED, E.MOVED, E.LIFTED)
+    assert (lifted.state, lifted.position_known) == (State.TAKE_LOAD, False)
+    weighed = {s.state for s in reachable(lifted, without={E.LOAD_TAKEN})}
+    assert State.MOVE not in weighed - {s.state for s in reachable(Situation(State.RECOVER), without={E.LOAD_TAKEN})}
+    level = after(E.LOAD_TAKEN, E.MEASURED, E.FITTED, E.LEVEL_NEEDED, start=lifted)
+    assert (level.state, level.position_known) == (State.LEVEL, True)
+
+
+def test_a_further_move_back_is_planned_and_confirmed_like_the_first():
+    settled = after(*TO_MOVE, E.MOVED)
+    for missing in (E.PLANNED, E.CONFIRMED):
+        assert State.MOVE not in {s.state for s in reachable(settled, without={missing})}
+
+
+def test_a_retreat_leads_back_to_a_measurement_or_farther_back():
     blocked = after(*TO_MOVE, E.MOVED, E.SETTLED, E.UNSEEN)
     assert (blocked.state, blocked.position_known) == (State.BLOCKED, False)
     back = after(E.RETREAT, E.PLANNED, E.CONFIRMED, start=blocked)

@@ -13,7 +13,7 @@ from docking.words import LANGUAGES, tell, texts
 
 ROOT = Path(__file__).parents[3]
 SAID = re.compile(
-    r'(?:notify|(?<!_)tell|_ask)\(\s*(?:language\(\), |self\._language, |request\.language, |[_A-Z| ]+, )?"(\w+)"'
+    r'(?:notify|(?<!_)tell|_ask)\(\s*(?:language\(\), |self\._language, |request\.language, |[_A-Za-z| ]+, )?"(\w+)"'
 )
 OUTCOMES = {"docked", "relieved", "out_of_tolerance", "stopped", "fault", "refused"}
 
