@@ -16,7 +16,7 @@ import click
 
 from docking.cli_devices import devices, monitor
 from docking.cli_fit import fit, study_pose, study_real, study_screening
-from docking.cli_guide import guide
+from docking.cli_guide import guide, study_guidance
 from docking.cli_home import home
 from docking.cli_survey import layout, network
 from docking.errors import (
@@ -269,6 +269,7 @@ cli.add_command(fit)
 study.add_command(study_screening)
 study.add_command(study_pose)
 study.add_command(study_real)
+study.add_command(study_guidance)
 cli.add_command(layout)
 cli.add_command(guide)
 cli.add_command(devices)

@@ -276,3 +276,28 @@ def steps(journal: Path, job: Path | None, done: str | None, undo: str | None, b
     else:
         print_text("\n".join(f"{state:5} {s.order} {s.name}: {s.text(language())} [{s.tool}]" for s, state in states))
     return EXIT_OK
+
+
+@click.command("guidance")
+@click.option("--scenes", type=click.IntRange(min=1), default=10, show_default=True, help="Rendered trajectories.")
+@click.option("--workers", type=click.IntRange(min=1), help="Processes (default: one a core).")
+@click.option("--report", type=FILE, help="Write the table to this HTML file.")
+@json_option
+def study_guidance(scenes: int, workers: int | None, report: Path | None, as_json: bool) -> int:
+    """Map rendered scans by every method and localise a walk in each: the published table, side by side.
+
+    \b
+    Example: docking study guidance --report guidance.html
+    """
+    from docking.study_guidance import GuidanceStudy, study_guidance, study_text
+
+    result = study_guidance(GuidanceStudy(scenes, workers), lambda text: print_text(text, err=as_json))
+    if report is not None:
+        from docking.report.guidance_page import write_guidance_page
+
+        write_guidance_page(result, study_text(result), report)
+    if as_json:
+        print_json(result)
+    else:
+        print_text(study_text(result))
+    return EXIT_OK

@@ -162,7 +162,7 @@ def _groups(rng: np.random.Generator, size: WallSize, X_WP: Pose) -> list[Marker
     markers: list[Marker] = []
     for g in range(size.groups):
         middle = np.array([size.width_mm * (g + 0.5) / size.groups, size.height_mm * rng.uniform(0.45, 0.6), 0.0])
-        for dx, dy in ((-125.0, -75.0), (125.0, -60.0), (-20.0, 85.0)):
+        for dx, dy in ((-145.0, -95.0), (145.0, -80.0), (-20.0, 105.0)):
             turn = Rotation.from_euler("z", rng.uniform(-6.0, 6.0), degrees=True).as_matrix()
             place = np.add(middle, (dx + rng.uniform(-10.0, 10.0), dy + rng.uniform(-10.0, 10.0), 0.0))
             markers.append(Marker(len(markers), X_WP @ Pose(turn, place)))

@@ -30,6 +30,8 @@ Rows = NDArray[np.intp]
 _MOST_SEARCHES = 5
 _GROWTH = 1.03
 """A search that finds this many times the points of the one before is followed by another."""
+_ENOUGH = 200
+"""So many points tell two poses apart."""
 _ALIKE, _APART = 1.25, 0.02
 """A second pose fits too when its rms is at most so many times the first one's; so many depths away it is another."""
 COVERAGE = 2.0
@@ -256,7 +258,8 @@ def _second_pose(camera: Camera, fit: CameraFit, sights: Sights) -> bool:
     A flat patch that fills little of the image looks nearly the same with its normal n and with n mirrored at the line
     of sight s: the camera turned about the patch's middle by the rotation that takes n to 2 (n.s) s - n.
     """
-    patch = sights.where(fit.inside)
+    rows = np.flatnonzero(fit.inside)
+    patch = sights.where(rows[:: max(1, len(rows) // _ENOUGH)])
     p_C = fit.X_WC.inverse().apply(patch.points_mm)
     middle = p_C.mean(axis=0)
     normal = np.linalg.svd(p_C - middle, full_matrices=False)[2][2]
