@@ -188,8 +188,7 @@ class _Solver:
         residuals = self.pixels - rows.projected
         size = np.hypot(*residuals) * self.inverse_sigma
         # Huber: beyond the limit the weight falls with 1/size.
-        weight = np.sqrt(self.robust_at / np.maximum(size, self.robust_at)) * self.inverse_sigma
-        weight[~np.isfinite(self.robust_at)] = self.inverse_sigma[~np.isfinite(self.robust_at)]
+        weight = np.sqrt(np.minimum(1.0, self.robust_at / np.maximum(size, 1e-12))) * self.inverse_sigma
         return Linearised(residuals * weight, rows.by_frame * weight, rows.by_point * weight, rows.by_camera * weight)
 
     def _stepped(self, state: _State, system: _Normal, damping: float) -> _State | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import acos, degrees
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from docking.types import Array, Pose
 SIGNS = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
 """Corners and circles in the marker's axes (x right, y up, z towards the viewer), from the top-left clockwise."""
 _REFINEMENTS = 2
+_ENLARGED = (2, 3)
+_LEAST_PERIMETER = 0.01
+"""Of a square, against the longer side of the image."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +76,10 @@ class MarkerDetector:
         settings = aruco.DetectorParameters()
         settings.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
         self._aruco = aruco.ArucoDetector(predefined(dictionary), settings)
+        closely = aruco.DetectorParameters()
+        closely.cornerRefinementMethod = aruco.CORNER_REFINE_APRILTAG
+        closely.minMarkerPerimeterRate = _LEAST_PERIMETER
+        self._closely = aruco.ArucoDetector(predefined(dictionary), closely)
         self._layout, self._camera = layout, camera
 
     @staticmethod
@@ -80,11 +88,21 @@ class MarkerDetector:
 
     def squares(self, image: Image) -> list[tuple[int, Array]]:
         """(id, corners (4, 2) px) of all ArUco squares, by id."""
-        corners, ids, _ = self._aruco.detectMarkers(image)
-        if ids is None:
-            return []
-        found = [(int(i), np.asarray(c, np.float64).reshape(4, 2)) for i, c in zip(ids.ravel(), corners, strict=True)]
-        return sorted(found, key=lambda item: (item[0], item[1][0, 0]))
+        return _by_id(_squares(self._aruco, image))
+
+    def small_squares(self, image: Image) -> list[tuple[int, Array]]:
+        """As `squares`, for photographs with markers of ten pixels: looked for in enlarged copies too (0.5 s)."""
+        cv2 = opencv()
+        found: list[tuple[int, Array]] = []
+        for factor in _ENLARGED:
+            large = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC)
+            # Pixel centres are integers: the corner of the image, not the first centre, stays where it is.
+            found += [(i, (corners + 0.5) / factor - 0.5) for i, corners in _squares(self._closely, large)]
+        once: list[tuple[int, Array]] = []
+        for marker_id, corners in [*found, *_squares(self._aruco, image)]:
+            if not any(i == marker_id and _overlap(corners, c) for i, c in once):
+                once.append((marker_id, corners))
+        return _by_id(once)
 
     def detect(self, image: Image) -> list[MarkerSighting]:
         """The markers of the layout in a grey image; a marker seen twice is dropped: one of the two is false."""
@@ -108,6 +126,23 @@ class MarkerDetector:
         if not poses:
             poses, errors = planar_poses(square, corners, camera)
         return MarkerSighting(marker_id, corners, seen, poses, errors)
+
+
+def _squares(detector: Any, image: Image) -> list[tuple[int, Array]]:
+    corners, ids, _ = detector.detectMarkers(image)
+    if ids is None:
+        return []
+    return [(int(i), np.asarray(c, np.float64).reshape(4, 2)) for i, c in zip(ids.ravel(), corners, strict=True)]
+
+
+def _by_id(squares: list[tuple[int, Array]]) -> list[tuple[int, Array]]:
+    return sorted(squares, key=lambda item: (item[0], item[1][0, 0]))
+
+
+def _overlap(a: Array, b: Array) -> bool:
+    """Whether two squares are one: their centres are closer than half a side."""
+    side = float(np.linalg.norm(a[0] - a[1]))
+    return float(np.linalg.norm(a.mean(axis=0) - b.mean(axis=0))) < 0.5 * side
 
 
 def _circle_centres(image: Image, H: Array, circles: Array, radius_mm: float) -> Array:

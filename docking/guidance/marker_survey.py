@@ -21,6 +21,9 @@ Sightings = tuple[tuple[MarkerSighting, ...], ...]
 """Of every key-frame: its markers."""
 
 
+_SIZE_SHARE = 0.1
+
+
 @dataclass(frozen=True)
 class RegistrationSettings:
     """`gate` for the method as published; `wide_gate` where every observation has a weight of its own (joint).
@@ -117,6 +120,7 @@ def triangulated(
 
 def register(ar_map: ArMap, layout: MarkerLayout, sightings: Sightings, settings: RegistrationSettings) -> Registered:
     """The similarity into the cell. Raises MarkersTooFew, MarkersDisagree."""
+    _refuse_other_unit(layout)
     circles, rejected = triangulated(ar_map.keyframes, ar_map.camera, layout, sightings, settings)
     if len(circles.points) < 3 or collinear(circles.known_mm):
         cause = "; ".join(f"marker {i}: {why}" for i, why in rejected.items())
@@ -130,6 +134,15 @@ def register(ar_map: ArMap, layout: MarkerLayout, sightings: Sightings, settings
         raise MarkersDisagree("markers", cause + "; ".join(f"marker {i}: {why}" for i, why in rejected.items()))
     kept = Circles(*(column[agree] for column in (circles.marker, circles.circle, circles.points, circles.known_mm)))
     return Registered(refined(similarity, kept.points, kept.known_mm), kept, rejected)
+
+
+def _refuse_other_unit(layout: MarkerLayout) -> None:
+    """A similarity takes any unit and any mixture of markers: the size of the marker itself must tell."""
+    sides = np.linalg.norm(layout.circles_mm - np.roll(layout.circles_mm, 1, axis=1), axis=2)
+    apart_mm, stated_mm = float(np.median(sides)), 2.0 * layout.circle_offset_mm
+    if not (abs(apart_mm / stated_mm - 1.0) <= _SIZE_SHARE):
+        cause = f"circles are {apart_mm:.4g} mm apart in the survey, {stated_mm:.4g} mm on the marker: another unit?"
+        raise MarkersDisagree("markers", cause)
 
 
 def _tolerance_mm(circles: Circles, settings: RegistrationSettings) -> float:
