@@ -61,8 +61,8 @@ class FitResult:
 def run_fit(nominal_path: str | Path, measured_path: str | Path, options: FitOptions | None = None) -> FitResult:
     """Screen and fit MEASURED to NOMINAL. Raises FileUnreadable, BadPointFile, BadArgument."""
     options = FitOptions() if options is None else options
-    nominal = read_points(Path(nominal_path), "nominal")
-    measured = read_points(Path(measured_path), "measured")
+    nominal = read_points(Path(nominal_path), "nominal", weighted=True)
+    measured = read_points(Path(measured_path), "measured", weighted=True)
     written = {**read_weights(Path(nominal_path)), **read_weights(Path(measured_path))}
     settings = settings_from(options, nominal, measured, written)
     nominal, measured = prepared(options, nominal, measured)

@@ -21,7 +21,8 @@ _COORDINATES = ("x_mm", "y_mm", "z_mm")
 _SIGMAS = ("sx_mm", "sy_mm", "sz_mm")
 _WEIGHT = "weight"
 _PLAIN, _FULL = ("name", *_COORDINATES), ("name", *_COORDINATES, *_SIGMAS)
-_HEADERS = (_PLAIN, _FULL, (*_PLAIN, _WEIGHT), (*_FULL, _WEIGHT))
+_HEADERS = (_PLAIN, _FULL)
+_WEIGHTED = (*_HEADERS, (*_PLAIN, _WEIGHT), (*_FULL, _WEIGHT))
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _LARGEST_MM = 1e7
 _MOST_NAMES = 2000
@@ -74,23 +75,26 @@ def _rows(path: Path) -> list[tuple[int, list[str]]]:
     return rows
 
 
-def _header(path: Path, rows: list[tuple[int, list[str]]]) -> tuple[str, ...]:
+def _header(
+    path: Path, rows: list[tuple[int, list[str]]], known: tuple[tuple[str, ...], ...] = _WEIGHTED
+) -> tuple[str, ...]:
     if not rows:
         _bad(path, "the file is empty", "the header is missing")
     line, fields = rows[0]
     header = tuple(f.lower() for f in fields)
-    if header not in _HEADERS:
+    if header not in known:
         _bad(path, f"line {line}: {','.join(fields)[:80]!r}", "the header is not understood")
     return header
 
 
-def read_points(path: Path, role: Role) -> Points:
+def read_points(path: Path, role: Role, *, weighted: bool = False) -> Points:
     """Read a point file; the frame is what the file says it is. Without sigma columns covariances are NaN (not known).
 
-    A nominal file names every point once. Raises FileUnreadable, BadPointFile.
+    A nominal file names every point once. A column of weights is refused unless `weighted`: who does not use weights
+    must not pass over them; `read_weights` reads them. Raises FileUnreadable, BadPointFile.
     """
     rows = _rows(path)
-    header = _header(path, rows)
+    header = _header(path, rows, _WEIGHTED if weighted else _HEADERS)
     first_line: dict[str, int] = {}
     seen: dict[str, int] = {}
     names, values, passes = [], [], []

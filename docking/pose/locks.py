@@ -124,4 +124,5 @@ def fit_locked(
         e += float(step[-1]) if held.expansion_sigma > 0.0 else 0.0
         if float(np.linalg.norm(size * (basis @ step))) < limit:
             return Solution(place.X, iteration, cov, c, e)
-    raise NotCongruent("fit", "the fit with locks does not converge", value=len(nominal_mm), limit=len(nominal_mm))
+    n = len(nominal_mm)
+    raise NotCongruent("fit", "no pose with these locks comes near the points", value=n, limit=n)

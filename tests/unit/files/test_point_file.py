@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from docking.errors import BadPointFile, FileUnreadable
-from docking.point_file import read_points
+from docking.point_file import read_points, read_weights
 
 HEAD = "name,x_mm,y_mm,z_mm\n"
 
@@ -74,3 +74,20 @@ def test_unreadable_files(tmp_path: Path) -> None:
 def test_too_many_points(tmp_path: Path) -> None:
     with pytest.raises(BadPointFile, match="2001 points"):
         read_points(file(tmp_path, HEAD + "".join(f"P{i},{i},0,0\n" for i in range(2001))), "measured")
+
+
+def test_weights_are_read_where_they_are_used_and_refused_elsewhere(tmp_path: Path) -> None:
+    path = file(tmp_path, "name,x_mm,y_mm,z_mm,weight\nA,1,2,3,4\nB,1,2,4,0.5\nA,1,2,3,4\n")
+    assert read_weights(path) == {"A": 4.0, "B": 0.5}
+    points = read_points(path, "measured", weighted=True)
+    assert points.xyz_mm.shape == (3, 3)
+    assert np.all(np.isnan(points.cov_mm2))
+    with pytest.raises(BadPointFile):
+        read_points(path, "measured")
+    both = file(tmp_path, "name,x_mm,y_mm,z_mm,sx_mm,sy_mm,sz_mm,weight\nA,1,2,3,0.1,0.2,0.3,7\n")
+    assert read_weights(both) == {"A": 7.0}
+    assert np.allclose(np.diag(read_points(both, "measured", weighted=True).cov_mm2[0]), [0.01, 0.04, 0.09])
+    for weight in ("0", "-1", "nan", ""):
+        with pytest.raises(BadPointFile):
+            read_weights(file(tmp_path, f"name,x_mm,y_mm,z_mm,weight\nA,1,2,3,{weight}\n"))
+    assert read_weights(file(tmp_path, "name,x_mm,y_mm,z_mm\nA,1,2,3\n")) == {}
