@@ -108,6 +108,12 @@ def test_fitting_error_counts_against_the_true_points() -> None:
 
 
 @pytest.mark.full
+def test_every_bar_in_full() -> None:
+    result = study_pose(FULL_DRAWS, 2, lambda text: None)
+    assert [bar for bar in result["bars"] if not bar["held"]] == []
+
+
+@pytest.mark.full
 def test_rms_in_full() -> None:
     for n, ratio in rms_ratios(range(3, 21), FULL_DRAWS, np.random.default_rng(9), BOX).items():
         assert 0.98 <= ratio <= 1.02, n
