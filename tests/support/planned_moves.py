@@ -65,8 +65,10 @@ def a_plan(
     return make_plan(request, site.positioners, site.settings)
 
 
-def a_shift(site: Site, shift_mm: Array, speed_mm_s: float, start_mm: Array) -> Plan:
-    """A plan straight along `shift_mm` (3,) without any turn, on the cycle of a CAN bus."""
+def a_shift(
+    site: Site, shift_mm: Array, speed_mm_s: float, start_mm: Array, *, period_s: float = 0.01, queued: bool = False
+) -> Plan:
+    """A plan straight along `shift_mm` (3,) without any turn."""
     correction = Correction(site.pivot_mm, np.zeros(3), np.asarray(shift_mm, dtype=np.float64))
-    request = PlanRequest(1, "align", "align", start_mm, correction, speed_mm_s, 0.01, linear_interpolation=False)
+    request = PlanRequest(1, "align", "align", start_mm, correction, speed_mm_s, period_s, queued)
     return make_plan(request, site.positioners, site.settings)

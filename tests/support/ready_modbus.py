@@ -24,15 +24,13 @@ from sim.plc.modbus_tcp import ModbusTcpConnection
 from sim.truth import TruthFile
 from sim.virtual_time import run_virtual
 from tests.support.motion_record import Record, RecordedPlant
-from tests.support.planned_moves import CELLS, a_plan, lab_site
+from tests.support.planned_moves import CELLS, a_plan, a_shift, lab_site
 
 MOVES_MM = 2e-4
 """More than this between two scans is motion: 0.02 mm/s."""
 ROUNDED_MM = 0.003
 """Segments are rounded to micrometres, servo lags differ by 5 %."""
 QUIET_S = 0.6
-WEIGHED_S = 0.15
-"""So long after a fault all axes have come to rest over GROUP_OK."""
 COMMAND_AT, RUN, RESUME = 0, 7, 10
 
 
@@ -40,7 +38,8 @@ COMMAND_AT, RUN, RESUME = 0, 7, 10
 class ModbusScene:
     """How a case is set up: cell, seed of plant and plan, size of the move, changes of `[bus]`.
 
-    `errors_off` are true errors of the simulated cell that this case does without.
+    `along`: straight along the axes of this letter instead of a direction of the seed. `errors_off` are true errors of
+    the simulated cell that this case does without.
     """
 
     name: str = "lab-modbus"
@@ -48,6 +47,7 @@ class ModbusScene:
     shift_mm: float = 6.0
     turn_deg: float = 0.2
     speed_mm_s: float = 4.0
+    along: str = ""
     bus: tuple[tuple[str, float], ...] = (("timeout_s", 0.05), ("watchdog_s", 0.12), ("poll_s", 0.05))
     errors_off: tuple[str, ...] = ()
 
@@ -65,6 +65,9 @@ def _plan(scene: ModbusScene, standing_mm: tuple[float, ...]) -> Plan:
     period_s = _files(scene.name)[0].bus.segment_s  # type: ignore[union-attr]
     seed = int(np.random.default_rng(scene.seed).integers(1000))
     start_mm = np.array(standing_mm)
+    if scene.along:
+        shift = scene.shift_mm * np.eye(3)["XYZ".index(scene.along)]
+        return a_shift(lab_site(scene.name), shift, scene.speed_mm_s, start_mm, period_s=period_s, queued=True)
     return a_plan(replace(lab_site(scene.name), **reach), seed, period_s=period_s, queued=True, start_mm=start_mm)
 
 
@@ -105,16 +108,16 @@ class ReadyModbus:
         self.plan = _plan(self.scene, tuple(standing.tolist()))
         await self.motion.load(self.plan)
 
-    async def move(self, share: float, fault: Callable[[ReadyModbus], Any], *, weigh: bool = False) -> None:
+    async def move(self, share: float, fault: Callable[[ReadyModbus], Any], *, weigh_s: float = 0.0) -> None:
         """Run the plan; at `share` of its time `fault` happens. Watch for a while, then close.
 
-        `weigh`: keep the true forces about the fault, too.
+        The true forces are kept from just before the fault until `weigh_s` after it.
         """
         self.start_s = self.loop.time()
         # Never on the beat of poll and scan.
         self.fault_s = self.start_s + share * self.plan.duration_s + 0.0137
-        if weigh:
-            self.recorded.weigh_from_s, self.recorded.weigh_until_s = self.fault_s - 0.02, self.fault_s + WEIGHED_S
+        if weigh_s > 0.0:
+            self.recorded.weigh_from_s, self.recorded.weigh_until_s = self.fault_s - 0.02, self.fault_s + weigh_s
         self.loop.call_at(self.fault_s, fault, self)
         try:
             self.result = await self.motion.start(self.plan.plan_hash)
@@ -220,6 +223,9 @@ class _Changed:
     def write(self, data: bytes) -> None:
         if self._act != "reply":
             self._transport.write(self._act(data))
+
+    def is_closing(self) -> bool:
+        return self._transport.is_closing()
 
     def close(self) -> None:
         self._transport.close()
