@@ -8,6 +8,7 @@ Camera axes: x right, y down, z forward; pixel centres at integers. Nothing here
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
 from typing import Any
 
@@ -149,6 +150,7 @@ def _reduced(texture: Picture, corners: Array, f: float) -> Picture:
     return reduced
 
 
+@cache
 def _distortion_maps(lens: Lens) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Where every fine pixel of the distorted picture comes from in the undistorted one (Newton on the radius)."""
     k = float(_OVERSAMPLING)
