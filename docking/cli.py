@@ -19,6 +19,7 @@ from docking.cli_fit import fit, study_pose, study_real, study_screening
 from docking.cli_guide import guide, study_guidance
 from docking.cli_home import home
 from docking.cli_survey import layout, network
+from docking.cli_track import study_tracking, track
 from docking.errors import (
     EXIT_FAULT,
     EXIT_OK,
@@ -270,6 +271,8 @@ study.add_command(study_screening)
 study.add_command(study_pose)
 study.add_command(study_real)
 study.add_command(study_guidance)
+cli.add_command(track)
+study.add_command(study_tracking)
 cli.add_command(layout)
 cli.add_command(guide)
 cli.add_command(devices)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from docking.errors import BadArgument, DockingError
-from docking.tracking.body import body_pose, described
+from docking.tracking.body import body_pose, described, points_from_pose
 from docking.tracking.faults import Alarms
 from docking.tracking.pointwise import FOR_A_POSE
 from docking.tracking.types import BodyModel, TrackedState
@@ -25,8 +25,8 @@ class EncoderSettings:
 
     noise_mm: float = 0.02
     offset_sd_mm: float = 10.0
-    scale_sd: float = 0.002
-    offset_walk_mm: float = 0.002
+    scale_sd: float = 0.001
+    offset_walk_mm: float = 0.001
     scale_walk: float = 1e-6
     history_s: float = 2.0
     stale_s: float = 0.5
@@ -134,6 +134,7 @@ class EncoderTracker:
     def _described(self, t_s: float, points: Array, cov: Array, R: Array) -> TrackedState:
         if len(points) >= FOR_A_POSE:
             pose = body_pose(self.body, points, cov)
+            points, cov = points_from_pose(self.body, pose)  # a rigid body: every point has the others' readings too
         else:
             X = Pose(R, (points - self.body.points_B_mm @ R.T).mean(axis=0))
             six = np.full((6, 6), np.nan)

@@ -35,7 +35,7 @@ class FollowSettings:
     model: InertialModel = GRADES["consumer"]
     rest: bool = True
     time_offset: bool = True
-    extras: Extras = field(default_factory=lambda: Extras(0.005, 0.01, 30.0))
+    extras: Extras = field(default_factory=lambda: Extras(0.005, 0.01, 0.01, 30.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,9 +98,9 @@ def follow(recording: Recording, gaps: Sequence[Gap], settings: FollowSettings) 
     return Followed(used, method, path, judged(used, path, gaps, hide), choice, late, alarms)
 
 
-def make_tracker(recording: Recording, method: str, settings: FollowSettings) -> Tracker:
+def make_tracker(recording: Recording, method: str, settings: FollowSettings, tilt_sd_rad: float = 0.01) -> Tracker:
     """The tracker of a method, started as the recording says."""
-    body, model, start = recording.body, settings.model, start_of(recording)
+    body, model, start = recording.body, settings.model, start_of(recording, tilt_sd_rad, heading_sd_rad=0.02)
     if method == "encoders":
         return EncoderTracker(body)
     if method == "published":

@@ -177,7 +177,8 @@ class InertialTracker:
         at = frame.rows[0]
         zero = np.zeros(3)
         p = frame.xyz_mm[0] - C @ self._arms_I[at]
-        nav = core.Navigation(t_s, p, zero, C, zero, zero, 0.0, zero, zero)
+        square = np.zeros((3, 3))
+        nav = core.Navigation(t_s, p, zero, C, zero, zero, 0.0, square, square, zero)
         sd = np.zeros(self._layout.size)
         sd[P] = 3.0 * np.sqrt(np.trace(frame.cov_mm2[0])) + np.linalg.norm(self._arms_I[at]) * 0.1
         sd[V] = self._start.velocity_sd_mm_s if self._start else 100.0
@@ -185,6 +186,7 @@ class InertialTracker:
         for place, value in (
             (self._layout.time, s.time_sd_s),
             (self._layout.scale, s.scale_sd),
+            (self._layout.force_scale, s.force_scale_sd),
             (self._layout.lever, s.lever_sd_mm),
         ):
             if place is not None:

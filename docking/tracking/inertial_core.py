@@ -2,9 +2,10 @@
 
 Error state, mm, s, rad: position p, velocity v of the sensor's origin in W, attitude phi in W (true = Exp(phi) C),
 force bias b_a (mm/s^2) and rate bias b_g in I: 15; behind them, as asked for, the time by which the sensor's stamps are
-late (1), a scale of the gyroscope (3), a lever arm (3). Between samples, with a = C f:
+late (1), scales and misalignments of gyroscope M and accelerometer N (9 each, by rows), a lever arm (3). Between
+samples, with a = C f:
 
-    p' = v    v' = -[a]x phi - C b_a    phi' = -C b_g + C diag(w) s_g
+    p' = v    v' = -[a]x phi - C b_a + C N f    phi' = -C b_g + C M w
 
 The covariance is carried over several samples at once with the sums of a and C over them; closed forms, no matrix
 exponential.
@@ -26,11 +27,12 @@ _EYE3 = np.eye(3)
 
 
 class Extras(NamedTuple):
-    """States beyond the fifteen and their sd at the start; 0 leaves one out: `time_sd_s`, `scale_sd` (ratio),
-    `lever_sd_mm`."""
+    """States beyond the fifteen and their sd at the start; 0 leaves one out: `time_sd_s`, `scale_sd` and
+    `force_scale_sd` (ratio, rad) of gyroscope and accelerometer, `lever_sd_mm`."""
 
     time_sd_s: float = 0.0
     scale_sd: float = 0.0
+    force_scale_sd: float = 0.0
     lever_sd_mm: float = 0.0
 
 
@@ -40,7 +42,8 @@ class Layout:
     def __init__(self, extras: Extras) -> None:
         self.size = BASE
         self.time = self._take(1, extras.time_sd_s)
-        self.scale = self._take(3, extras.scale_sd)
+        self.scale = self._take(9, extras.scale_sd)
+        self.force_scale = self._take(9, extras.force_scale_sd)
         self.lever = self._take(3, extras.lever_sd_mm)
 
     def _take(self, count: int, sd: float) -> slice | None:
@@ -51,7 +54,8 @@ class Layout:
 
 
 class Navigation(NamedTuple):
-    """Nominal state at `t_s`: `p_mm`, `v_mm_s` (3,) of the sensor in W, `C_WI` (3, 3), biases, and the extra states."""
+    """Nominal state at `t_s`: `p_mm`, `v_mm_s` (3,) of the sensor in W, `C_WI` (3, 3), biases, and the extra states:
+    `scale` and `force_scale` are (3, 3)."""
 
     t_s: float
     p_mm: Array
@@ -61,6 +65,7 @@ class Navigation(NamedTuple):
     rate_bias: Array
     late_s: float
     scale: Array
+    force_scale: Array
     lever_mm: Array
 
     def moved(self, dx: Array, layout: Layout) -> Navigation:
@@ -74,37 +79,44 @@ class Navigation(NamedTuple):
             self.force_bias_mm_s2 + dx[BA],
             self.rate_bias + dx[BG],
             self.late_s + (float(dx[layout.time][0]) if layout.time else 0.0),
-            self.scale + dx[layout.scale] if layout.scale else self.scale,
+            self.scale + dx[layout.scale].reshape(3, 3) if layout.scale else self.scale,
+            self.force_scale + dx[layout.force_scale].reshape(3, 3) if layout.force_scale else self.force_scale,
             self.lever_mm + dx[layout.lever] if layout.lever else self.lever_mm,
         )
 
 
 class Since(NamedTuple):
-    """Sums over the samples since the covariance was last carried on: duration, velocity gained by specific force,
-    the way that it brought, and the angle turned, in I."""
+    """Sums over the samples since the covariance was last carried on: duration, velocity gained by specific force, the
+    way that it brought, and in I the angle turned and the specific force times time."""
 
     dt_s: float
     dv_mm_s: Array
     ds_mm: Array
     angle_rad: Array
+    push_mm_s: Array
 
 
-NOTHING = Since(0.0, np.zeros(3), np.zeros(3), np.zeros(3))
+NOTHING = Since(0.0, np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
 
 
 def integrate(nav: Navigation, since: Since, t_s: float, force: Array, rate: Array) -> tuple[Navigation, Since]:
     """Advance to `t_s` with the interval's mean specific force (mm/s^2) and rate (rad/s), both as measured."""
-    _, p, v, C, force_bias, rate_bias, late, scale, lever = nav
-    summed_s, summed_dv, summed_ds, summed_angle = since
+    _, p, v, C, force_bias, rate_bias, late, scale, force_scale, lever = nav
+    summed_s, summed_dv, summed_ds, summed_angle, summed_push = since
     dt = t_s - nav.t_s
-    angle = (rate - rate_bias) * (dt * (1.0 + scale))
+    angle = dt * (rate - rate_bias)
+    angle = angle + scale @ angle
     x, y, z = angle.tolist()
     after = C @ turn(x, y, z)
-    dv = (C + after) @ ((0.5 * dt) * (force - force_bias))
+    push = dt * (force - force_bias)
+    push = push + force_scale @ push
+    dv = 0.5 * ((C + after) @ push)
     gained = dv + G_W_MM_S2 * dt
-    moved = Navigation(t_s, p + (v + 0.5 * gained) * dt, v + gained, after, force_bias, rate_bias, late, scale, lever)
+    moved = Navigation(
+        t_s, p + (v + 0.5 * gained) * dt, v + gained, after, force_bias, rate_bias, late, scale, force_scale, lever
+    )
     ds = summed_ds + (summed_dv + 0.5 * dv) * dt
-    return moved, Since(summed_s + dt, summed_dv + dv, ds, summed_angle + angle)
+    return moved, Since(summed_s + dt, summed_dv + dv, ds, summed_angle + angle, summed_push + push)
 
 
 def squared(nav: Navigation) -> Navigation:
@@ -124,6 +136,7 @@ class Propagation:
         self._layout = layout
         self._force, self._rate = (model.force_density * MM_PER_M) ** 2, model.rate_density**2
         self._force_walk, self._rate_walk = (model.force_walk * MM_PER_M) ** 2, model.rate_walk**2
+        self._slip = model.rate_slip**2
         self._i3 = np.arange(3)
 
     def __call__(self, cov: Array, C_before: Array, C_after: Array, since: Since) -> tuple[Array, Array]:
@@ -139,18 +152,21 @@ class Propagation:
         # phi grows by -C b_g t meanwhile, so half of it has acted on the velocity, a third of that on the way
         phi[V, BG], phi[P, BG] = (0.5 * dt) * (slope @ C), (dt / 3.0) * (way @ C)
         if self._layout.scale is not None:
-            phi[PHI, self._layout.scale] = C * since.angle_rad
+            phi[PHI, self._layout.scale] = np.multiply.outer(C, since.angle_rad).reshape(3, 9)
+        if self._layout.force_scale is not None:
+            gained = np.multiply.outer(C, since.push_mm_s).reshape(3, 9)
+            phi[V, self._layout.force_scale], phi[P, self._layout.force_scale] = gained, (0.5 * dt) * gained
         after = phi @ cov @ phi.T
-        self._add_noise(after, dt)
+        self._add_noise(after, dt, float(since.angle_rad @ since.angle_rad))
         return phi, after
 
-    def _add_noise(self, cov: Array, dt: float) -> None:
+    def _add_noise(self, cov: Array, dt: float, angle2: float) -> None:
         i, v, a = self._i3, self._i3 + 3, self._force
         cov[i, i] += a * dt**3 / 3.0
         cov[i, v] += a * dt * dt / 2.0
         cov[v, i] += a * dt * dt / 2.0
         cov[v, v] += a * dt
-        cov[i + 6, i + 6] += self._rate * dt
+        cov[i + 6, i + 6] += self._rate * dt + self._slip * angle2 / dt
         cov[i + 9, i + 9] += self._force_walk * dt
         cov[i + 12, i + 12] += self._rate_walk * dt
 

@@ -26,6 +26,8 @@ class InertialModel:
     Densities of white noise: `force_density` m/s^2/sqrt(Hz), `rate_density` rad/s/sqrt(Hz). Biases at switching on:
     `force_bias` m/s^2, `rate_bias` rad/s, and their random walks: `force_walk` m/s^2/sqrt(s), `rate_walk`
     rad/s/sqrt(s). `force_range`, `rate_range`: largest value an axis can show; at it the sensor is saturated.
+    `rate_slip` sqrt(s): what of the turning rate is wrong beyond scale and misalignment, as white noise in proportion
+    to the rate.
     """
 
     force_density: float
@@ -36,6 +38,7 @@ class InertialModel:
     rate_walk: float
     force_range: float = 16.0 * 9.80665
     rate_range: float = 2000.0 * 0.017453292519943295
+    rate_slip: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
