@@ -21,8 +21,9 @@ FORWARD = ["lift", "level", "align", "approach", "approach"]
 
 def blocked_at_3_mm(folder: Path, moves: int, scenario: Callable[[DryCell], None], more: int = 0) -> DryCell:
     """View blocked 3 mm before the mate; `moves` back; then `more` further moves are confirmed, and no others."""
-    person = Person([].append, [Event.RETREAT], {len(FORWARD) + 2 + more: Event.DECLINED})
-    person.moves = moves
+    heard: list[str] = []
+    person = Person(heard.append, [Event.RETREAT], {len(FORWARD) + 2 + more: Event.DECLINED})
+    person.moves, person.heard = moves, heard  # type: ignore[attr-defined]
 
     def prepare(run: DryCell) -> None:
         run.controller.procedure.operator = person
@@ -146,6 +147,55 @@ def test_a_force_that_rises_on_the_way_back_stops_it_on_the_path(axis, tmp_path)
     assert 0.3 < moved["path_time_s"] / run.plans[-1].duration_s < 0.95
     assert run.figure_gap_mm(run.setpoints_mm()[1], run.plans[-1]).max() <= 0.002
     assert run.drift_mm < 0.005
+
+
+class Slower:
+    """The motion side on a computer that has become slow: no move faster than this."""
+
+    def __init__(self, motion: Any, speed_limit_mm_s: float) -> None:
+        self._motion, self.speed_limit_mm_s = motion, speed_limit_mm_s
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._motion, name)
+
+
+@pytest.mark.full
+def test_a_move_back_that_is_not_as_it_was_shown_is_asked_for_again(tmp_path):
+    """The permitted speed falls after the first of three moves back: the second is asked for by itself."""
+
+    def scenario(run: DryCell) -> None:
+        known = run.controller.procedure.known
+
+        def slow(kind: str, body: dict[str, Any]) -> None:
+            if kind == "moved" and kinds(run)[-1:] == ["retreat"]:
+                known.motion = Slower(run.controller.procedure.motion, 0.5)
+
+        run.journal.hooks.append(slow)
+
+    run = blocked_at_3_mm(tmp_path, 3, scenario, more=1)
+    assert kinds(run) == [*FORWARD, "retreat", "retreat"]
+    assert [len(c["further"]) for c in run.records("confirm") if "further" in c] == [2, 0]
+    assert any("not the one that was shown" in text for text in run.person.heard)
+    assert np.abs(np.diff(run.plans[-1].q_mm, axis=0)).max() / run.plans[-1].period_s <= 0.5 * (1 + 1e-6)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(
+    ("name", "after", "moves"),
+    [("fuselage-can", 4, 3), ("follower-can", 4, 3), ("lab-modbus", 2, 1), ("lab-modbus", 2, 2)],
+)
+def test_every_kind_of_cell_goes_back_from_10_mm_to_its_stand_off(name, after, moves, tmp_path):
+    person = Person([].append, [Event.RETREAT], {after + 2: Event.DECLINED})
+    person.moves = moves
+
+    def prepare(run: DryCell) -> None:
+        run.controller.procedure.operator = person
+        blocked_view(run, after, "retreat")
+
+    run = run_dry(name, 1, tmp_path, prepare)
+    assert run.state is State.RECOVER, run.alarms()
+    assert kinds(run)[after:] == ["retreat"] * moves
+    assert run.plans[-1].q_mm[-1] == pytest.approx(run.plans[after - moves].q_mm[0], abs=0.05)
 
 
 @pytest.mark.full

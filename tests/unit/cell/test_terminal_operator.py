@@ -108,6 +108,27 @@ async def test_without_a_way_back_no_retreat_is_taken(keyboard):
     assert await asked(keyboard, ask, "r", "m") is Event.AGAIN
 
 
+PLACES = ("approach-10", "Align", "align", "lift", "start")
+
+
+@pytest.mark.parametrize(
+    ("words", "moves"),
+    [
+        (("1",), 1),
+        (("3",), 3),
+        (("align",), 2),
+        (("LIFT",), 4),
+        (("start",), 5),
+        (("all",), 5),
+        (("全部",), 5),
+        (("0", "6", "-1", "1.5", "dock", "", "2"), 2),
+    ],
+)
+async def test_how_far_back_is_a_number_a_place_or_all(keyboard, words, moves):
+    assert await asked(keyboard, lambda operator: operator.how_far(PLACES), *words) == moves
+    assert any("1 = approach-10, 2 = Align" in text for text in keyboard.said)
+
+
 @pytest.mark.parametrize(
     ("way", "word", "event"),
     [(False, "g", Event.CONFIRMED), (True, "g", Event.CONFIRMED), (True, "r", Event.RETREAT)],
