@@ -97,7 +97,9 @@ def study_screening(draws: int, workers: int | None, as_json: bool) -> int:
 @click.option(
     "--draws", type=click.IntRange(min=1), default=20000, show_default=True, help="Draws of every figure, 100 or more."
 )
-@click.option("--seed", type=int, default=1, show_default=True, help="Another seed draws other errors.")
+@click.option(
+    "--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Another seed draws other errors."
+)
 @click.option("--out", type=FILE, default=Path("studies/pose"), show_default=True, help="Folder of page and pictures.")
 @json_option
 def study_pose(draws: int, seed: int, out: Path, as_json: bool) -> int:
@@ -113,8 +115,9 @@ def study_pose(draws: int, seed: int, out: Path, as_json: bool) -> int:
 
     check_drawing()
     from docking.study_pose import study_pose, study_text
-    from docking.study_pose.page import write_study
+    from docking.study_pose.page import make_folder, write_study
 
+    make_folder(out)
     result = study_pose(draws, seed, lambda text: print_text(text, err=True))
     page = write_study(result, out)
     if as_json:

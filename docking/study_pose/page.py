@@ -17,12 +17,20 @@ from docking.study_pose.table import PAPER_MM
 TITLE = "A pose from points: the paper's study with many draws"
 
 
+def make_folder(folder: Path) -> None:
+    """Make the folder before the work is done rather than after it. Raises FileUnwritable."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileUnwritable(str(folder), error.strerror or str(error)) from error
+
+
 def write_study(result: dict[str, Any], folder: Path) -> Path:
     """Write `pose.html`, `pose.json` and the pictures as SVG into a folder; the page's path. Raises FileUnwritable."""
     inline = {}
     page = folder / "pose.html"
+    make_folder(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         with style():
             for name, figure in drawings(result).items():
                 inline[name] = svg(figure, name)

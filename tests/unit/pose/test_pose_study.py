@@ -81,11 +81,16 @@ def test_page_stands_alone(result: dict[str, Any], tmp_path: Path) -> None:
     assert json.loads((tmp_path / "study" / "pose.json").read_text())["held"] is True
 
 
-def test_command_refuses_too_few_draws(capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_refuses_what_it_cannot_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(BadArgument):
         study_pose(10, 1, print)
-    assert call(["study", "pose", "--draws", "10", "--json"]) == 2
-    assert json.loads(capsys.readouterr().out)["error"]["code"] == 4004
+    out = ["--out", str(tmp_path / "study"), "--json"]
+    for wrong in (["--draws", "10"], ["--seed", "-1"]):
+        assert call(["study", "pose", *wrong, *out]) == 2
+        assert json.loads(capsys.readouterr().out)["error"]["code"] == 4004
+    (tmp_path / "study" / "file").write_text("")
+    assert call(["study", "pose", "--out", str(tmp_path / "study" / "file"), "--json"]) == 2
+    assert json.loads(capsys.readouterr().out)["error"]["code"] == 4005
 
 
 @pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.name)
