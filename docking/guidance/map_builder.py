@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 
@@ -20,12 +21,16 @@ from docking.guidance.guided import looks, search, sights, visible
 from docking.guidance.images import Picture
 from docking.guidance.opencv import opencv
 from docking.guidance.pose_only import CameraFit, Sights, refine
-from docking.guidance.two_views import Rows, TwoViews, match, start
+from docking.guidance.two_views import Rows, TwoViews, decided, match, start
 from docking.guidance.types import ArMap, Camera
 from docking.types import Pose
 
 START_DEPTH = 1000.0
 """Median depth of the first points: the unit of the free map, so that its numbers look like mm."""
+
+
+_RIVALS_KEPT = 4
+_Taken = tuple[Picture, Features]
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,7 @@ class BuilderSettings:
     features: int = 1500
     overlap_least: float = 0.9
     overlap_wanted: float = 0.96
+    longest_s: float = 0.4
     longest_stride: int = 12
     least_points: int = 60
     start_parallax_deg: float = 2.0
@@ -60,9 +66,7 @@ class MapBuilder:
 
     def build(self, scan: Iterable[Picture]) -> ArMap:
         """The map in a free frame. Raises MapNotBuilt when no start is found or the scan is lost soon."""
-        pictures = iter(scan)
-        self._start(pictures)
-        self._follow(pictures)
+        self._follow(self._start(iter(scan)))
         if len(self.map.frames) < 3:
             raise MapNotBuilt("scan", f"only {len(self.map.frames)} key-frames hold together")
         self._finish()
@@ -75,26 +79,35 @@ class MapBuilder:
             raise MapNotBuilt("scan", f"{cause} {self.camera.height_px}")
         return extract(picture.image, self.settings.features)
 
-    def _start(self, pictures: Iterator[Picture]) -> None:
-        """The first two key-frames: the first picture, and the next with enough parallax to it."""
-        first: tuple[Picture, Features] | None = None
-        tried = 0
-        for picture in pictures:
-            features = self._features(picture)
-            if first is None:
-                first = picture, features
-                continue
-            tried += 1
-            two = start(self.camera, first[1], features)
-            if two is not None and two.parallax_deg >= self.settings.start_parallax_deg and not two.ambiguous:
-                self._first_map(first, (picture, features), two)
-                return
-            if (two is None and tried > 3) or tried > self.settings.start_frames:
-                # The view has left the first picture: start again from here.
-                first, tried = (picture, features), 0
-        raise MapNotBuilt("scan", "no two images with parallax and common features")
+    def _start(self, pictures: Iterator[Picture]) -> Iterator[Picture]:
+        """Make the first two key-frames; returns the pictures that come after them.
 
-    def _first_map(self, a: tuple[Picture, Features], b: tuple[Picture, Features], two: TwoViews) -> None:
+        A pair with one explanation is taken at once; rivals wait for a picture that decides between them.
+        """
+        first: _Taken | None = None
+        waiting: list[tuple[_Taken, list[TwoViews], int]] = []
+        since: list[Picture] = []
+        for picture in pictures:
+            taken = picture, self._features(picture)
+            if first is None or len(since) >= self.settings.start_frames:
+                first, waiting, since = taken, [], []
+                continue
+            for other, rivals, place in waiting[-_RIVALS_KEPT:]:
+                two = decided(self.camera, rivals, other[1], taken[1])
+                if two is not None:
+                    self._first_map(first, other, two)
+                    return chain(since[place:], [picture], pictures)
+            since.append(picture)
+            rivals = start(self.camera, first[1], taken[1])
+            rivals = [two for two in rivals if two.parallax_deg >= self.settings.start_parallax_deg]
+            if len(rivals) == 1:
+                self._first_map(first, taken, rivals[0])
+                return pictures
+            if rivals:
+                waiting.append((taken, rivals, len(since)))
+        raise MapNotBuilt("scan", "no images with parallax and common features that leave one explanation")
+
+    def _first_map(self, a: _Taken, b: _Taken, two: TwoViews) -> None:
         scale = START_DEPTH / float(np.median(two.points[:, 2]))
         first = self.map.add_frame(a[0].name, a[0].t_s, Pose.identity(), a[1])
         X_AB = Pose(two.X_AB.R, two.X_AB.t_mm * scale)
@@ -113,6 +126,8 @@ class MapBuilder:
         while True:
             while len(waiting) < self._stride and (picture := next(pictures, None)) is not None:
                 waiting.append(picture)
+                if picture.t_s - self.map.frames[-1].t_s >= self.settings.longest_s:
+                    break
             if not waiting:
                 return
             taken = self._next(waiting)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import zipfile
 from dataclasses import asdict
@@ -70,7 +71,7 @@ def load_map(folder: Path) -> ArMap:
     """Read a map that `save_map` wrote. Raises FileUnreadable, ConfigInvalid when it is not a whole map."""
     try:
         head = json.loads((folder / _JSON).read_text("utf-8"))
-        with np.load(folder / _ARRAYS, allow_pickle=False) as archive:
+        with np.load(io.BytesIO((folder / _ARRAYS).read_bytes()), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
     except OSError as error:
         raise FileUnreadable(str(folder), error.strerror or str(error)) from error

@@ -1,7 +1,8 @@
 """The start of a map: relative pose of two images from essential matrix and homography, whichever explains more.
 
 A wall is a plane: there the essential matrix is ill-determined and the homography is right; before boxes it is the
-other way round. Both give several poses; the one with the most points in front of both cameras wins.
+other way round. Both give several poses; the one with the most points in front of both cameras wins. Two views of a
+plane alone leave two poses that fit alike: a third view tells which of the planes is real.
 """
 
 from __future__ import annotations
@@ -11,8 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from docking.errors import NotLocalised
 from docking.guidance.features import Features
 from docking.guidance.opencv import opencv
+from docking.guidance.pose_only import Sights, refine
 from docking.guidance.triangulation import parallax_deg, triangulate
 from docking.guidance.types import Camera
 from docking.types import Array, Pose
@@ -24,20 +27,25 @@ _CONFIDENCE = 0.999
 _REPROJECTION_PX = 2.5
 _NEXT_BEST = 0.8
 """Another pose that explains more than this share of the points makes the start ambiguous."""
-_SAME_ROTATION = 0.02
+_SAME_POSE = 0.1
+"""Distance of two poses, rotation and unit baseline together, below which they are one explanation."""
+_CLEARLY = 0.75
+"""The better rival misses so much less."""
+_LEAST_MATCHES = 50
+_UNIT = 100.0
+"""Brings a scene with a baseline of 1 to lengths like mm."""
 _MOST_BITS = 64
 
 
 @dataclass(frozen=True, eq=False)
 class TwoViews:
-    """X_AB of the second camera in the first (unit baseline), the matches used and their points in the first camera."""
+    """One explanation: X_AB of the second camera in the first (unit baseline), matches, points in the first camera."""
 
     X_AB: Pose
     rows_a: Rows
     rows_b: Rows
     points: Array
     parallax_deg: float
-    ambiguous: bool
 
 
 def match(a: Features, b: Features, rows_a: Rows, rows_b: Rows) -> tuple[Rows, Rows]:
@@ -53,23 +61,49 @@ def match(a: Features, b: Features, rows_a: Rows, rows_b: Rows) -> tuple[Rows, R
     return rows_a[first], rows_b[second]
 
 
-def start(camera: Camera, a: Features, b: Features) -> TwoViews | None:
-    """The relative pose of two images, or None where no pose explains them."""
+def start(camera: Camera, a: Features, b: Features) -> list[TwoViews]:
+    """The relative poses that explain two images, best first: none, one, or rivals that a third view must decide."""
     rows_a, rows_b = match(a, b, np.arange(len(a.octaves)), np.arange(len(b.octaves)))
-    if len(rows_a) < 50:
-        return None
+    if len(rows_a) < _LEAST_MATCHES:
+        return []
     rays_a, rays_b = camera.undistort(a.keypoints_px[rows_a]), camera.undistort(b.keypoints_px[rows_b])
     judged = [_judge(camera, X, rays_a, rays_b) for X in _candidates(camera, rays_a, rays_b)]
     judged.sort(key=lambda item: -int(item[1].sum()))
-    if not judged:
+    if not judged or judged[0][1].sum() < _LEAST_MATCHES:
+        return []
+    found: list[TwoViews] = []
+    for X_AB, good, points in judged:
+        apart = [np.linalg.norm(np.c_[f.X_AB.R - X_AB.R, f.X_AB.t_mm - X_AB.t_mm]) for f in found]
+        if good.sum() <= _NEXT_BEST * judged[0][1].sum() or min(apart, default=1.0) < _SAME_POSE:
+            continue
+        angle = float(np.median(parallax_deg(np.zeros(3), X_AB.t_mm, points[good])))
+        found.append(TwoViews(X_AB, rows_a[good], rows_b[good], points[good], angle))
+    return found
+
+
+def decided(camera: Camera, rivals: list[TwoViews], b: Features, c: Features) -> TwoViews | None:
+    """Of rival explanations the one that a third image agrees with, None while it agrees with several."""
+    misses = [(_miss_px(camera, two, b, c), k) for k, two in enumerate(rivals)]
+    misses.sort()
+    if len(misses) > 1 and not (misses[0][0] <= _CLEARLY * misses[1][0]):
         return None
-    X_AB, good, points = judged[0]
-    if good.sum() < 50:
-        return None
-    rivals = [item for item in judged[1:] if np.linalg.norm(item[0].R - X_AB.R) > _SAME_ROTATION]
-    ambiguous = any(item[1].sum() > _NEXT_BEST * good.sum() for item in rivals)
-    angle = float(np.median(parallax_deg(np.zeros(3), X_AB.t_mm, points[good])))
-    return TwoViews(X_AB, rows_a[good], rows_b[good], points[good], angle, ambiguous)
+    return rivals[misses[0][1]]
+
+
+def _miss_px(camera: Camera, two: TwoViews, b: Features, c: Features) -> float:
+    """Median distance in a third image between points of one explanation and their features, at the best pose."""
+    rows_b, rows_c = match(b, c, two.rows_b, np.arange(len(c.octaves)))
+    if len(rows_b) < _LEAST_MATCHES:
+        return float("inf")
+    place = np.full(len(b.octaves), -1)
+    place[two.rows_b] = np.arange(len(two.rows_b))
+    points, pixels = two.points[place[rows_b]] * _UNIT, c.keypoints_px[rows_c]
+    try:
+        fit = refine(camera, Pose(two.X_AB.R, two.X_AB.t_mm * _UNIT), Sights(points, pixels, np.ones(len(points))))
+    except NotLocalised:
+        return float("inf")
+    miss = np.linalg.norm(camera.project(fit.X_WC.inverse().apply(points)) - pixels, axis=1)
+    return float(np.nanmedian(miss)) if np.isfinite(miss).any() else float("inf")
 
 
 def _candidates(camera: Camera, rays_a: Array, rays_b: Array) -> list[Pose]:
