@@ -67,7 +67,8 @@ class Knowledge:
     async def make(self, kind: str, stage: str, correction: Correction, speed_mm_s: float) -> Plan:
         """Plan and check a move from where the component was measured; raises as `make_plan`."""
         p, settings = self.progress, self.settings
-        p.kind, p.scene = kind, self.approach.scene(self.component(), self.mate(), self.station())
+        fit, mate, station = self.component(), self.mate(), self.station()
+        p.kind, p.scene = kind, await self.survey.aside(lambda: self.approach.scene(fit, mate, station))
         request = PlanRequest(
             plan_id=p.moves + 1,
             stage=stage,

@@ -199,7 +199,7 @@ class Procedure(Activity[Progress]):
             sigma_mm=float(errors.sigma_mm[i]),
             tolerance_mm=float(errors.tolerance_mm[i]),
         )
-        return self._decide(station) if self._agreed(fit, mate) else Event.MEASURE_MORE
+        return await self._decide(station) if self._agreed(fit, mate) else Event.MEASURE_MORE
 
     def _agreed(self, fit: Fit, mate: Fit) -> bool:
         """Whether the points kept out of the fits agree with them; False asks for more passes."""
@@ -210,13 +210,14 @@ class Procedure(Activity[Progress]):
         self.progress.rejected.add(error.where)
         self.operator.notify("set_aside", error=error)
 
-    def _decide(self, station: Station) -> Event:
+    async def _decide(self, station: Station) -> Event:
         p, approach = self.progress, self.known.approach
         verdict = approach.verdict(p.history, station)
         if verdict.action is Action.MEASURE_MORE:
             return Event.MEASURE_MORE
         if verdict.action is Action.MOVE:
-            correction = approach.correction(self.known.component(), self.known.mate(), station)
+            fit, mate = self.known.component(), self.known.mate()
+            correction = await self._survey.aside(lambda: approach.correction(fit, mate, station))
             gap_mm = None if p.raised_only else station.standoff_mm
             check_correction(correction, self.known.settings.guard, station.name, gap_mm)
             p.corrections, p.kind, p.stood_at = p.corrections + 1, "align", p.stage
@@ -235,9 +236,9 @@ class Procedure(Activity[Progress]):
     async def _plan(self) -> Event:
         state, station, approach = self.known, self.known.station(), self.known.approach
         fit, mate = state.component(), state.mate()
-        correction = approach.correction(fit, mate, station)
+        correction = await self._survey.aside(lambda: approach.correction(fit, mate, station))
         plan = await state.make(self.progress.kind, station.name, correction, station.speed_mm_s)
-        goal = approach.docked_goal(fit, mate)
+        goal = await self._survey.aside(lambda: approach.docked_goal(fit, mate))
         names = approach.features.names
         self.journal.write("goal", records.goal_record(goal, approach.goal, names, station.name))
         self.journal.write("plan", records.plan_record(plan))

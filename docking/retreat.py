@@ -59,10 +59,14 @@ class Retreat:
 
     async def _plans(self, moves: int) -> tuple[Plan, ...]:
         state, p = self._known, self._known.progress
-        way = [Gone(step.plan, step.path_time_s, step.scene, self._scene_now(step)) for step in p.way]
         asked = WayBack(moves, state.axes_mm(), p.moves + 1, state.motion.speed_limit_mm_s)
         positioners, settings = state.settings.positioners, state.settings.plan
-        return await state.survey.aside(lambda: retreat_plans(way, asked, positioners, settings))
+
+        def plans() -> tuple[Plan, ...]:
+            way = [Gone(step.plan, step.path_time_s, step.scene, self._scene_now(step)) for step in p.way]
+            return retreat_plans(way, asked, positioners, settings)
+
+        return await state.survey.aside(plans)
 
     def _scene_now(self, step: Executed) -> Scene:
         approach = self._known.approach
