@@ -12,7 +12,7 @@ import numpy as np
 from docking import records
 from docking.config.budget import docked_pose
 from docking.config.build import load_from, plan_period_s, plan_settings, positioners_from
-from docking.config.cell import CellFile, ModbusBus
+from docking.config.cell import CellFile
 from docking.config.job import JobFile, Stage
 from docking.config.load import default_job_path, load_cell, load_job
 from docking.config.raising import raising_from
@@ -72,7 +72,7 @@ class Preview:
                 correction=correction,
                 speed_mm_s=stage.speed_mm_s,
                 period_s=plan_period_s(self.cell),
-                linear_interpolation=isinstance(self.cell.bus, ModbusBus),
+                linear_interpolation=self.cell.bus.queued,
                 scene=Scene(here, self._mate, self._docked, stage.standoff_mm, before_mm),
             )
             plan = make_plan(request, self.positioners, self.settings)

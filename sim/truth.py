@@ -194,7 +194,7 @@ class Misalignment(Model):
 
 class Drives(Model):
     """Servo drives and brakes as they really are; drives on CAN react as `sync_loss` says to `sync_loss_cycles` without
-    SYNC. `follower_friction` is of the force that a force-controlled axis holds."""
+    SYNC, and have these `modes` of operation. `follower_friction` is of the force that a force-controlled axis holds."""
 
     servo_lag_s: Positive
     servo_lag_spread: NonNegative
@@ -208,6 +208,7 @@ class Drives(Model):
     sync_loss: Literal["hold", "ignore", "extrapolate", "quick-stop", "fault"]
     sync_loss_cycles: Positive = 3.0
     watchdog_scatter_s: NonNegative = 0.0
+    modes: tuple[int, ...] = (6, 8, 10)
 
 
 class InstrumentTruth(Model):

@@ -21,7 +21,6 @@ from docking.config.build import (
     positioners_from,
     relief_settings,
 )
-from docking.config.cell import ModbusBus
 from docking.config.nominal import (
     ers_points,
     feature_points,
@@ -141,7 +140,7 @@ def _procedure_settings(cell: CellFile, job: JobFile, positioners: Positioners) 
         X_WT=pose_from_vector(cell.tracker.station_pose),
         X_WM=pose_from_vector(job.mate.pose),
         period_s=plan_period_s(cell),
-        linear_interpolation=isinstance(cell.bus, ModbusBus),
+        linear_interpolation=cell.bus.queued,
         drift_mm_per_s=cell.tracker.drift_um_per_h * 1e-3 / 3600.0,
         target_residual_mm=limits.target_residual_mm,
         rms_limit_mm=job.rms_limit_mm,

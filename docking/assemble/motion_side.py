@@ -11,7 +11,7 @@ from docking.assemble.wires import Addresses, NearBus
 from docking.config import CellFile, JobFile
 from docking.config.cell import ModbusBus
 from docking.config.inputs import InputsConfig, ModbusModule
-from docking.errors import DockingError
+from docking.errors import ConfigInvalid, DockingError
 from docking.motion import QueuedMotion, StreamedMotion
 from docking.motion.arbiter import Mode
 from docking.motion.channel import QueueChannel
@@ -24,6 +24,7 @@ from docking.ports import LoadCells
 from docking.transcript import Transcript
 from drivers.canopen.io_module import CanIoModule
 from drivers.canopen.positioners import CanopenPositioners
+from drivers.canopen.profile_positioners import ProfilePositioners
 from drivers.canopen.shared import SharedCan
 from drivers.inputs import SILENT_AFTER, InputModule, WiredInputs
 from drivers.load_cells import AnalogueLoadCells
@@ -65,6 +66,10 @@ def _axes(cell: CellFile, job: JobFile, near: NearBus, tap: Tap | None, cells: L
         return QueuedMotion(positioners, watch, cell.bus.poll_s)
     if near.can is None:
         raise ValueError("a CANopen cell needs the near end of its bus")
+    if cell.bus.profile_position:
+        if cells is not None:
+            raise ConfigInvalid(cell.name, ("bus.profile_position: not together with wired load cells",))
+        return QueuedMotion(ProfilePositioners(cell, near.can), watch, cell.bus.cycle_s)
     drives = CanopenPositioners(cell, near.can) if cells is None else WeighedDrives(cell, near.can, cells)
     return StreamedMotion(drives, watch, cell.limits.tick_late_cycles)
 
@@ -106,7 +111,7 @@ def input_rules(inputs: InputsConfig) -> InputRules:
 def service_settings(cell: CellFile) -> ServiceSettings:
     """What the motion side does for its cell. PLCs keep the time of a move themselves, but live on the heartbeat."""
     bus, limits, motion = cell.bus, cell.limits, cell.motion
-    queued = isinstance(bus, ModbusBus)
+    queued = bus.queued
     return ServiceSettings(
         lease_s=motion.lease_s,
         feedback_s=motion.feedback_s,

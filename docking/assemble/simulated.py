@@ -87,6 +87,7 @@ class FarEnd:
             sync_loss_cycles=drives.sync_loss_cycles,
             shared_cpu=shared_cpu,
             watchdog_scatter_s=drives.watchdog_scatter_s,
+            supported_modes=sum(1 << (mode - 1) for mode in drives.modes),
         )
         modules = [m for m in cell.inputs.modules if isinstance(m, CanModule)] if cell.inputs else []
         shared = SharedEnd(wire)

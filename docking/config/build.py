@@ -121,7 +121,7 @@ def plan_settings(cell: CellFile, job: JobFile) -> PlanSettings:
         sync_error_mm=limits.sync_error_mm,
         start_skew_s=bus.start_skew_s,
         clock_ppm=bus.clock_ppm if isinstance(bus, ModbusBus) else 0.0,
-        playback_ramp_s=bus.ramp_s if isinstance(bus, ModbusBus) else 0.0,
+        playback_ramp_s=bus.ramp_s if bus.queued else 0.0,
         jam=jam_settings(cell),
         mate=mate_settings(cell, job),
     )

@@ -31,6 +31,10 @@ class DriveScale(Model):
 Framing = Literal["8N1", "8N2", "8E1", "8O1"]
 
 
+PROFILE_RAMP_S = 0.5
+"""From rest to full speed, and back, of drives that ramp by themselves."""
+
+
 class CanBus(Model):
     kind: Literal["canopen"] = Field(description="twelve or fewer CiA 402 drives that take one position each cycle")
     interface: str = Field(description="python-can interface name, such as socketcan")
@@ -55,6 +59,11 @@ class CanBus(Model):
         description="at every start, with the axes disabled, the heartbeat pauses until every drive has missed it",
     )
     map: str = Field(default="cia402", description="object map in drivers/maps")
+    profile_position: bool = Field(
+        default=False,
+        description="the drives have neither cyclic synchronous nor interpolated position: plans are cut into straight "
+        "pieces from rest to rest, which each drive goes by its own ramps (profile position)",
+    )
     counts_per_mm: Positive = Field(default=10000.0, description="position units of the drives in one mm")
     identity: DriveIdentity = Field(
         default=DriveIdentity(), description="vendor, product and revision that every drive must show (1018h)"
@@ -73,8 +82,18 @@ class CanBus(Model):
 
     @property
     def start_skew_s(self) -> float:
-        """How far apart two axes may begin one cycle: nothing on one SYNC."""
-        return self.sync_skew_s if self.further_channels else 0.0
+        """How far apart two axes may begin: nothing on one SYNC that they follow."""
+        return self.sync_skew_s if self.further_channels or self.profile_position else 0.0
+
+    @property
+    def queued(self) -> bool:
+        """The devices play what they were given by themselves."""
+        return self.profile_position
+
+    @property
+    def ramp_s(self) -> float:
+        """How long a drive takes in profile position from full speed to rest."""
+        return PROFILE_RAMP_S
 
 
 class ModbusBus(Model):
@@ -110,6 +129,11 @@ class ModbusBus(Model):
         default=0.002, description="following error of a healthy axis, divided by its speed, s"
     )
     map: str = Field(default="positioner_plc", description="register map in drivers/maps")
+
+    @property
+    def queued(self) -> bool:
+        """The devices play what they were given by themselves."""
+        return True
 
     @model_validator(mode="after")
     def _line_where_there_is_one(self) -> Self:

@@ -54,6 +54,7 @@ class CyclicImage:
         self._image["mode"] = omap.position_modes[0].mode
         self._enable_bits: NDArray[np.uint16] = np.zeros(len(self.driven), np.uint16)
         self._switching = False
+        self._resting: set[int] = set()
         self._target = self._image["target"]
         cob = omap.pdos["set_points"].cob
         self.set_point_cobs = [*(cob + self.nodes[int(i)].node for i in self.driven), *self.forces.cobs]
@@ -104,6 +105,7 @@ class CyclicImage:
         row = self._slots.get(index)
         if row is not None:
             self._image["mode"][row], self._enable_bits[row] = mode.mode, mode.enable_bits
+            (self._resting.add if mode.rests else self._resting.discard)(index)
             self._switching, self._dirty = bool(self._enable_bits.any()), True
 
     def command_all(self, controlword: int) -> None:
@@ -282,9 +284,10 @@ class CyclicImage:
         return bool(self._words[index] & self._brake)
 
     def follows(self, index: int) -> bool:
-        """Enabled, brake open, and following its set-points."""
+        """Enabled, brake open, and following its set-points; one that rests until an edge has nothing to follow."""
         enabled = self.state(index) is DriveState.OPERATION_ENABLED
-        return enabled and bool(self._words[index] & self._follows) and not self._words[index] & self._brake
+        leads = index in self._resting or bool(self._words[index] & self._follows)
+        return enabled and leads and not self._words[index] & self._brake
 
     def age_cycles(self, index: int) -> int:
         return self.cycles - self._seen[index]

@@ -20,7 +20,7 @@ class DriveProof:
     def __init__(self, node: AxisNode, bus: CanBus, omap: ObjectMap, sdo: SdoClient) -> None:
         self._node, self._bus, self._map, self._sdo = node, bus, omap, sdo
         self._holds_force = node.force_n is not None
-        self.position_mode = omap.position_modes[0]
+        self.position_mode = next(mode for mode in omap.position_modes if mode.rests is bus.profile_position)
 
     async def who(self) -> Identity:
         """Prove device profile, vendor, product, revision and serial number, that nobody else answers, and the mode.
@@ -85,10 +85,13 @@ class DriveProof:
                 raise self._without("cyclic synchronous torque", modes, f"mode {force_mode.mode}")
             self._expect("rated_torque", await self._read("rated_torque"), force_mode.rated_torque_mnm)
             return
-        known = self._map.position_modes
+        known = [mode for mode in self._map.position_modes if mode.rests is self._bus.profile_position]
         supported = [mode for mode in known if modes >> mode.supported_mode_bit & 1]
         if not supported:
             names = " and no ".join(mode.name for mode in known)
+            others = [mode.name for mode in self._map.position_modes if modes >> mode.supported_mode_bit & 1]
+            if others:
+                names += f", only {others[0]}: bus.profile_position says which is wanted, no"
             raise self._without(names, modes, "mode " + " or ".join(str(mode.mode) for mode in known))
         self.position_mode = supported[0]
 

@@ -47,14 +47,16 @@ class PdoEntry:
 
 @dataclass(frozen=True)
 class PositionMode:
-    """One way of following a set-point each cycle: its bit in 6502h, its number for 6060h, the PDO of the set-points,
-    what is added to the controlword once the drive is enabled, what is written besides."""
+    """One way of taking set-points: its bit in 6502h, its number for 6060h, the PDO of the set-points, what is added to
+    the controlword once the drive is enabled, whether the drive rests until an edge tells it to go to its target
+    instead of following one set-point a cycle, what is written besides."""
 
     name: str
     supported_mode_bit: int
     mode: int
     set_points: str
     enable_bits: int = 0
+    rests: bool = False
     written: tuple[tuple[str, int | str], ...] = ()
 
 

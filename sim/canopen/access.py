@@ -34,6 +34,9 @@ class ObjectAccess:
             (0x607D, 2): limits.high_mm,
             (0x607C, 0): drives.homing.home_mm,
             (0x6099, 1): drives.homing.speed_mm_s,
+            (0x6081, 0): drives.profile.speed_mm_s,
+            (0x6083, 0): drives.profile.acceleration_mm_s2,
+            (0x6084, 0): drives.profile.deceleration_mm_s2,
         }
         self._numbers: dict[int, list[int]] = {
             0x605A: limits.quick_stop_option,

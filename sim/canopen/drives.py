@@ -7,7 +7,6 @@ worked one by one; `busy` says that there are such axes.
 from __future__ import annotations
 
 from collections.abc import Callable
-from enum import IntEnum
 from typing import Final
 
 import numpy as np
@@ -16,7 +15,11 @@ from numpy.typing import NDArray
 from docking.types import Array
 from sim.canopen.homing import HOMING, Homing
 from sim.canopen.parameters import BoolArray, ForceTargets, Parameters
+from sim.canopen.profile import PP, Profile
 from sim.canopen.settings import DriveSettings
+from sim.canopen.stages import Stage, transition
+
+__all__ = ["CSP", "CST", "FOLLOWING_ERROR", "HOST_LOST", "IP", "SYNC_LOST", "Drives", "Stage"]
 
 IP: Final = 7
 CSP: Final = 8
@@ -27,19 +30,8 @@ SYNC_LOST: Final = 0x8700
 
 _FOLLOWS, _WINDOW, _BRAKE, _LIMIT = 1 << 12, 1 << 13, 1 << 14, 1 << 11
 _INTERPOLATE = 1 << 4
+_OWN_BITS = 1 << 10 | 1 << 12 | 1 << 13
 _REMOTE_AND_VOLTAGE = 1 << 9 | 1 << 4
-
-
-class Stage(IntEnum):
-    """States, each with the statusword bits 0..6 that report it."""
-
-    SWITCH_ON_DISABLED = 0x40
-    READY = 0x21
-    SWITCHED_ON = 0x23
-    OPERATION = 0x27
-    QUICK_STOP = 0x07
-    FAULT_REACTION = 0x0F
-    FAULT = 0x08
 
 
 _POWERED = (Stage.OPERATION, Stage.QUICK_STOP, Stage.FAULT_REACTION)
@@ -62,6 +54,8 @@ class Drives:
         self.braked: BoolArray = np.ones(count, np.bool_)
         self.following: BoolArray = np.zeros(count, np.bool_)
         self.forces = ForceTargets(count, self.parameters)
+        self.profile = Profile(count)
+        self.targets: Array = start_mm.copy()
         self.homing = Homing(count, settings.homed, settings.zero_off_mm)
         self.statuswords: NDArray[np.uint16] = np.zeros(count, np.uint16)
         self.error_codes: list[int] = [0] * count
@@ -100,6 +94,11 @@ class Drives:
         if self.busy:
             self._work(t_s, dt_s, standing_mm())
         return self._now
+
+    def note_targets(self, rows: NDArray[np.intp], target_mm: Array) -> None:
+        """Targets (r,) that an edge of the controlword at the same SYNC may make drives go to by themselves."""
+        if PP in self.modes:
+            self.targets[rows] = target_mm - self.homing.shift_mm[rows]
 
     def latch(self, rows: NDArray[np.intp], target_mm: Array) -> None:
         """Take targets (r,) for the axes `rows` (r,) at a SYNC; axes that do not follow keep standing."""
@@ -163,7 +162,7 @@ class Drives:
                 self._emergency(index, 0)
                 self._enter(index, Stage.SWITCH_ON_DISABLED, t_s)
             return
-        target = _transition(stage, word)
+        target = transition(stage, word)
         if index in self._own_stops:
             # A drive that has stopped by itself wants to be told anew, not to hear the same word once more.
             if word == before:
@@ -175,6 +174,9 @@ class Drives:
             self._enter(index, target, t_s)
         elif self.modes[index] == IP and not word & _INTERPOLATE and self.following[index]:
             self._rest(index)
+        elif self.modes[index] == PP and stage is Stage.OPERATION:
+            self.profile.control(index, before, word, float(self.targets[index]))
+            self._report(index)
         elif self.modes[index] == HOMING and stage is Stage.OPERATION:
             self.homing.control(index, before, word, float(self._standing_mm()[index]))
             self._report(index)
@@ -233,7 +235,7 @@ class Drives:
     def _begin_ramp(self, index: int, stage: Stage, t_s: float) -> None:
         if self.stages[index] is Stage.OPERATION:
             speed = (self._goal[index] - self._start[index]) / self.cycle_s
-            own = self.forces.speed_mm_s(index) if self.forces.pressing[index] else 0.0
+            own = self.forces.speed_mm_s(index) if self.forces.pressing[index] else self.profile.speed(index)
             self._speed[index] = speed if self.following[index] else own
         self._enter(index, stage, t_s)
 
@@ -259,6 +261,7 @@ class Drives:
                 self._now = self._now.copy()
                 self._now[index] = self._standing_mm()[index]
             self.homing.leave(index)
+            self.profile.leave(index)
             self.following[index] = False
             self._goal = self._goal.copy()
             self._goal[index] = self._now[index]
@@ -282,12 +285,7 @@ class Drives:
                 now[index] = self._ramp(index, dt_s, float(now[index]))
                 self._finish_ramp(index, t_s)
             elif stage is Stage.OPERATION and not self._leads(index):
-                if self.modes[index] == HOMING and not self.braked[index] and index not in self._brake_due:
-                    now[index] = self.homing.step(index, dt_s, float(now[index]))
-                    self._report(index)
-                else:
-                    now[index] = standing_mm[index]
-                    self._begin_following(index)
+                self._move_alone(index, dt_s, now, standing_mm)
             elif stage is not Stage.OPERATION:
                 if index not in self._brake_due:
                     self.powered[index] = False
@@ -297,6 +295,18 @@ class Drives:
         self._goal = np.where(kept & self.following, self._goal, now)
         self._start = np.where(kept & self.following, self._start, now)
         self.busy = bool(self._brake_due) or any(self._pending(index) for index in range(len(self.stages)))
+
+    def _move_alone(self, index: int, dt_s: float, now: Array, standing_mm: Array) -> None:
+        """One step of an enabled axis that follows no set-points: `now` (m,) gets where it is to be."""
+        by_itself = {HOMING: self.homing.step, PP: self.profile.step}.get(self.modes[index])
+        if by_itself is None or self.braked[index] or index in self._brake_due:
+            now[index] = standing_mm[index]
+            self._begin_following(index)
+            return
+        before_mm, word = float(now[index]), int(self.statuswords[index])
+        now[index] = by_itself(index, dt_s, before_mm)
+        if now[index] != before_mm or word & _OWN_BITS != self._own_bits(index):
+            self._report(index)
 
     def _pending(self, index: int) -> bool:
         stage = self.stages[index]
@@ -352,6 +362,12 @@ class Drives:
         for index in rows:
             self._report(int(index))
 
+    def _own_bits(self, index: int) -> int:
+        """What a mode that moves by itself says in bits 10, 12 and 13."""
+        if self.modes[index] == HOMING:
+            return self.homing.bits(index)
+        return self.profile.bits(index) if self.modes[index] == PP else 0
+
     def _report(self, index: int) -> None:
         """Compose the statusword."""
         word = int(self.stages[index]) | _REMOTE_AND_VOLTAGE
@@ -359,27 +375,6 @@ class Drives:
         word |= _LIMIT if self._limited[index] or self._switched[index] else 0
         word |= _BRAKE if self.braked[index] else 0
         word |= _WINDOW if self.error_codes[index] == FOLLOWING_ERROR else 0
-        word |= self.homing.bits(index) if self.modes[index] == HOMING else 0
+        word |= self._own_bits(index)
         self.statuswords[index] = word
         self.changed = True
-
-
-def _transition(stage: Stage, word: int) -> Stage | None:
-    """Next state for a controlword, None to stay."""
-    enable, off = word & 0x0F == 0x0F, not word & 2
-    halt, shutdown, on = word & 6 == 2, word & 7 == 6, word & 0x0F == 7
-    if stage is Stage.SWITCH_ON_DISABLED:
-        return Stage.READY if shutdown else None
-    if stage in (Stage.READY, Stage.SWITCHED_ON) and (off or halt):
-        return Stage.SWITCH_ON_DISABLED
-    if stage is Stage.READY:
-        return Stage.SWITCHED_ON if on or enable else None
-    if stage is Stage.SWITCHED_ON:
-        return Stage.READY if shutdown else Stage.OPERATION if enable else None
-    if stage is Stage.OPERATION:
-        if off or halt:
-            return Stage.SWITCH_ON_DISABLED if off else Stage.QUICK_STOP
-        return Stage.READY if shutdown else Stage.SWITCHED_ON if on else None
-    if stage is Stage.QUICK_STOP:
-        return Stage.SWITCH_ON_DISABLED if off else Stage.OPERATION if enable else None
-    return None

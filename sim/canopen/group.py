@@ -281,10 +281,12 @@ class DriveGroup:
             forces = np.frombuffer(joined, _FORCE_RPDO, offset=count * _RPDO.itemsize)
             self._latch_forces(self._force_rows, forces, now_s)
         words, modes = image["controlword"].tobytes(), image["mode"].tobytes()
+        target_mm = image["target"] / self._counts_per_mm
+        self.drives.note_targets(self._fast_rows, target_mm)
         if words != self._last_words or modes != self._last_modes or self._relatch:
             self._obey(self._fast_rows.tolist(), image, now_s)
             self._last_words, self._last_modes = words, modes
-        self.drives.latch(self._fast_rows, image["target"] / self._counts_per_mm)
+        self.drives.latch(self._fast_rows, target_mm)
         self._last_joined, self._relatch = joined, self.drives.busy
         self._pending.clear()
         self._pending_forces.clear()
@@ -311,8 +313,10 @@ class DriveGroup:
             return
         rows = np.array(list(self._pending), dtype=np.intp)
         image = np.frombuffer(b"".join(self._pending.values()), _RPDO)
+        target_mm = image["target"] / self._counts_per_mm
+        self.drives.note_targets(rows, target_mm)
         self._obey(rows.tolist(), image, now_s)
-        self.drives.latch(rows, image["target"] / self._counts_per_mm)
+        self.drives.latch(rows, target_mm)
         self._pending.clear()
         self._last_joined = b""
 
