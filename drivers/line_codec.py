@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,8 +86,7 @@ def encode(kind: str, seq: int, *fields: str | int) -> bytes:
     return line
 
 
-@dataclass(frozen=True)
-class PointLine:
+class PointLine(NamedTuple):
     """`$PNT`: coordinates and their standard deviations in whole micrometres, frame of the station."""
 
     seq: int
@@ -151,10 +151,10 @@ _IDN = re.compile(f"IDN,{_SEQ},([0-9]{{1,3}}),{_TEXT},{_TEXT},{_TEXT},{_TEXT}")
 
 
 def _point(g: tuple[str, ...]) -> PointLine:
-    n = [int(v) for v in g[3:]]
-    if n[6] & ~FLAG_MASK:
-        raise ValueError(f"unknown flags {n[6]}")
-    return PointLine(int(g[0]), int(g[1]), g[2], (n[0], n[1], n[2]), (n[3], n[4], n[5]), n[6])
+    x, y, z, sx, sy, sz, flags = map(int, g[3:])
+    if flags & ~FLAG_MASK:
+        raise ValueError(f"unknown flags {flags}")
+    return PointLine(int(g[0]), int(g[1]), g[2], (x, y, z), (sx, sy, sz), flags)
 
 
 def parse_body(body: str) -> Reply:

@@ -1,8 +1,8 @@
 """The only importer of pymodbus: one unit behind a strict wrapper. Registers travel as big-endian bytes.
 
-pymodbus connects, numbers and frames the requests. It would accept replies of a wrong length or function, and a reply
-with transaction 0 as an answer to anything: here each reply frame is judged as bytes and never reaches its decoder; a
-stale reply is dropped. Nothing is sent twice.
+pymodbus connects and carries bytes. It would take replies of a wrong length or function, and a reply with transaction 0
+for the answer to anything: here each request is numbered and framed, each reply frame judged as bytes, and none reaches
+its decoder; a stale reply is dropped. Nothing is sent twice.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ import asyncio
 import logging
 import struct
 from collections.abc import Callable
+from typing import cast
 
 from pymodbus.client import AsyncModbusTcpClient
-from pymodbus.pdu import ModbusPDU
 
 from docking.errors import BadReply, DeviceRefused, DeviceSilent, LinkLost, OutcomeUnknown, PortMissing
 from drivers.modbus_requests import EXCEPTIONS, READS, WRITE, RegisterUnit
@@ -36,18 +36,6 @@ def tapped(tap: Tap | None, name: str) -> Callable[[bool, bytes], None] | None:
     return lambda sent, data: hear(name, sent, data)
 
 
-class _Request(ModbusPDU):
-    """A request whose body is ready-made."""
-
-    def __init__(self, function: int, body: bytes, unit: int) -> None:
-        super().__init__(dev_id=unit)
-        self.function_code = function
-        self.body = body
-
-    def encode(self) -> bytes:
-        return self.body
-
-
 class ModbusUnit(RegisterUnit):
     """One unit at `host`:`port`. Construct it inside the running loop; one request at a time.
 
@@ -61,11 +49,11 @@ class ModbusUnit(RegisterUnit):
         self.where, self._unit, self._timeout_s = where, unit, timeout_s
         self.on_lost: Callable[[], None] = lambda: None
         self.tap: Callable[[bool, bytes], None] | None = None
-        self._tapped = b""
         self._address = f"{host}:{port}"
-        self._request: _Request | None = None
+        self._asked = self._number = 0
         self._reply: asyncio.Future[tuple[int, bytes]]
-        self._body_bytes = self._skipped = 0
+        self._body_bytes = 0
+        self._buffer = b""
         self.stale_replies = 0
         self._client = AsyncModbusTcpClient(
             host,
@@ -73,9 +61,11 @@ class ModbusUnit(RegisterUnit):
             timeout=CONNECT_S,
             retries=0,
             reconnect_delay=0,
-            trace_packet=self._inspect,
             trace_connect=self._connection,
         )
+        # Bytes go past its own parsing and its log, which cost as much as the rest of an exchange.
+        self._wire = self._client.ctx
+        self._wire.data_received = self._received  # type: ignore[method-assign]
 
     @property
     def connected(self) -> bool:
@@ -92,84 +82,82 @@ class ModbusUnit(RegisterUnit):
 
     async def _ask(self, function: int, body: bytes, body_bytes: int) -> bytes:
         """Send one request; return the body of its reply, which carries `body_bytes` of data."""
-        if self._request is not None:
+        if self._asked:
             raise RuntimeError(f"{self.where}: a request is already under way")
         if not self.connected:
             raise LinkLost(self.where, "not connected")
-        self._request = request = _Request(function, body, self._unit)
-        self._body_bytes, self._skipped = body_bytes, 0
+        self._asked, self._body_bytes, self._buffer = function, body_bytes, b""
+        self._number = self._number % 0xFFFF + 1
         loop = asyncio.get_running_loop()
         self._reply = loop.create_future()
-        overdue = loop.call_later(self._timeout_s, lambda: self._fail(self._overdue(function)))
+        overdue = loop.call_later(self._timeout_s, self._fail_overdue)
+        frame = _MBAP.pack(self._number, 0, len(body) + 2, self._unit, function) + body
         try:
-            await self._client.execute(True, request)
+            if self.tap is not None:
+                self.tap(True, frame)
+            cast(asyncio.WriteTransport, self._wire.transport).write(frame)
             answered, data = await self._reply
         finally:
             overdue.cancel()
-            self._request = None
+            self._asked = 0
         if answered != function:
             raise DeviceRefused(self.where, EXCEPTIONS.get(data[0], "unknown exception"), value=data[0])
         return data
+
+    def _fail_overdue(self) -> None:
+        self._fail(self._overdue(self._asked))
 
     def _overdue(self, function: int) -> DeviceSilent | OutcomeUnknown:
         if function in READS:
             return DeviceSilent(self.where, f"{self._address} did not answer a read", limit=self._timeout_s)
         return OutcomeUnknown(self.where, f"No reply within {self._timeout_s} s.", value=f"write (function {function})")
 
-    def _inspect(self, sending: bool, data: bytes) -> bytes:
-        """Let pymodbus send, and keep what comes from it: the answer of the request is taken once it is whole."""
-        request = self._request
+    def _received(self, data: bytes) -> None:
+        """Take what has arrived; what is no whole frame yet waits for the rest, nobody waits for what was not asked."""
         if self.tap is not None:
-            self._tell(sending, data)
-        if sending or request is None:
-            return data if sending else b""
+            self.tap(False, data)
+        if self._asked:
+            buffer = self._buffer + data
+            self._buffer = buffer[self._judge(buffer) :]
+
+    def _judge(self, data: bytes) -> int:
+        """Look for the answer among whole frames; frames of other numbers are stale. Returns the bytes judged."""
         at = 0
         while len(data) - at >= _MBAP.size:
             transaction, protocol, length, unit, function = _MBAP.unpack_from(data, at)
             if protocol != 0 or not 3 <= length <= 254:
-                return self._refuse(f"no Modbus TCP frame: {data[at : at + 12].hex(' ')}")
+                self._refuse(f"no Modbus TCP frame: {data[at : at + 12].hex(' ')}")
+                return len(data)
             end: int = at + 6 + length
             if end > len(data):
                 break
-            if transaction == request.transaction_id:
+            if transaction == self._number:
                 body = data[at + _MBAP.size : end]
-                complaint = self._complaint(request, unit, function, body)
-                return self._refuse(complaint) if complaint else self._take(function, body)
-            # The buffer keeps what was skipped until the next request: count each stale frame once.
-            if at >= self._skipped:
-                self.stale_replies += 1
-                self._skipped = end
+                complaint = self._complaint(unit, function, body)
+                if complaint:
+                    self._refuse(complaint)
+                elif not self._reply.done():
+                    self._reply.set_result((function, body))
+                return len(data)
+            self.stale_replies += 1
             at = end
-        return b""
+        return at
 
-    def _tell(self, sent: bool, data: bytes) -> None:
-        """Received bytes come again together with those behind them, until a frame is whole."""
-        fresh = data[len(self._tapped) :] if not sent and data.startswith(self._tapped) else data
-        self._tapped = b"" if sent else data
-        if self.tap is not None and fresh:
-            self.tap(sent, fresh)
-
-    def _complaint(self, request: _Request, unit: int, function: int, body: bytes) -> str:
+    def _complaint(self, unit: int, function: int, body: bytes) -> str:
         """Why the reply is of the wrong unit, function or length; empty when it fits."""
         if unit != self._unit:
             return f"unit {unit} answered for unit {self._unit}"
-        if function == request.function_code | 0x80 and len(body) == 1:
+        if function == self._asked | 0x80 and len(body) == 1:
             return ""
-        if function != request.function_code:
-            return f"function {function} answered for function {request.function_code}"
+        if function != self._asked:
+            return f"function {function} answered for function {self._asked}"
         counted = function != WRITE
         if len(body) - counted != self._body_bytes or (counted and body[0] != self._body_bytes):
             return f"{len(body) - counted} bytes of data instead of {self._body_bytes}"
         return ""
 
-    def _take(self, function: int, body: bytes) -> bytes:
-        if not self._reply.done():
-            self._reply.set_result((function, body))
-        return b""
-
-    def _refuse(self, complaint: str) -> bytes:
+    def _refuse(self, complaint: str) -> None:
         self._fail(BadReply(self.where, "The connection is not trusted any more.", value=complaint))
-        return b""
 
     def _connection(self, up: bool) -> None:
         if not up:
@@ -178,5 +166,5 @@ class ModbusUnit(RegisterUnit):
 
     def _fail(self, error: Exception) -> None:
         """End the pending request at once."""
-        if self._request is not None and not self._reply.done():
+        if self._asked and not self._reply.done():
             self._reply.set_exception(error)

@@ -6,6 +6,7 @@ import os
 import pty
 import statistics
 import threading
+import time
 import tty
 
 import serial
@@ -24,13 +25,15 @@ def measure(sizes: Sizes) -> list[Metric]:
     times = side_by_side(
         {"ours": lambda: _parse(data, len(lines)), "readline": lambda: _readline(lines)}, sizes.repeats
     )
-    ours, theirs = statistics.median(times["ours"]), statistics.median(times["readline"])
+    # The line is as fast on a busy machine as on an idle one: beside it stands the time of the processor.
+    ours = statistics.median(_cpu_s(data, len(lines)) for _ in range(sizes.repeats))
+    theirs = statistics.median(times["readline"])
     line_rate = BAUD / 10.0 / (len(data) / len(lines))
     rate = len(lines) / ours
     return [
         Metric(
             "P1",
-            "tracker frames/s, bytes to checked points",
+            "tracker frames, bytes to checked points, a second of CPU",
             f"{rate:.0f}/s",
             f"the line at {BAUD} baud {line_rate:.1f}/s",
             rate / line_rate,
@@ -39,7 +42,7 @@ def measure(sizes: Sizes) -> list[Metric]:
         Metric(
             "P1",
             "the same against reading the lines only",
-            f"{rate:.0f}/s",
+            f"{len(lines) / statistics.median(times['ours']):.0f}/s",
             f"pyserial readline over a pty {len(lines) / theirs:.0f}/s",
             median_ratio(times["readline"], times["ours"]),
             50.0,
@@ -53,6 +56,12 @@ def _line(i: int) -> bytes:
         i % 65536, 82_600_000_000 + 10_000 * i, i % 100, 14_123_456 + i, -8_876_050 - i, 1_250_000 + i, 122, 131, 130,
     )  # fmt: skip
     return b"$" + body + b"*%04X\r\n" % crc16_arc(body)
+
+
+def _cpu_s(data: bytes, count: int) -> float:
+    began_s = time.process_time()
+    _parse(data, count)
+    return time.process_time() - began_s
 
 
 def _parse(data: bytes, count: int) -> None:
