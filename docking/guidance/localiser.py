@@ -30,6 +30,8 @@ Rows = NDArray[np.intp]
 _MOST_SEARCHES = 5
 _GROWTH = 1.03
 """A search that finds this many times the points of the one before is followed by another."""
+_LIMITS = 1.5
+"""A pose that could draw a corner of the picture off by so many times the limit is none."""
 _ENOUGH = 200
 """So many points tell two poses apart."""
 _ALIKE, _APART = 1.25, 0.02
@@ -91,6 +93,16 @@ class Localised:
         p_C = np.array([0.0, 0.0, self.depth_mm]) if p_W_mm is None else self.X_WC.inverse().apply(p_W_mm)
         seen = seen_sigma_mm(self.cov, p_C)
         return COVERAGE * float(np.hypot(seen, self.map_sigma_mm))
+
+    def corner_error_mm(self) -> float:
+        """The predicted error at the worst corner of the picture, at the median depth, by this picture alone.
+
+        Errors of the map are left out: they are the same whatever is seen.
+        """
+        camera = self.camera
+        corners = np.array([[x, y] for x in (0.0, camera.width_px) for y in (0.0, camera.height_px)])
+        rays = np.column_stack([camera.undistort(corners), np.ones(4)]) * self.depth_mm
+        return COVERAGE * max(seen_sigma_mm(self.cov, ray) for ray in rays)
 
     @property
     def sigma_mm(self) -> float:
@@ -242,11 +254,17 @@ class Localiser:
         if _second_pose(self.camera, fit, guided.sights(self.ar_map, features, rows, points)):
             raise self._refused("two poses fit what is seen, turned about the part in view", count, s.least_points)
         generation = float(np.mean(self.index.generation[points[inside]]))
-        sigma = max(s.map_sigma_mm, self.ar_map.quality.marker_rms_mm or 0.0) * float(np.sqrt(1.0 + generation))
-        return Localised(
+        sigma = max(s.map_sigma_mm, self.ar_map.quality.marker_rms_mm or 0.0) * float((1.0 + generation) ** 1.5)
+        found = Localised(
             fit.X_WC, fit.cov, "map", count, expected, fit.rms_px, depth, sigma, generation,
             self.camera, features, rows[inside], points[inside],
         )  # fmt: skip
+        reach = found.corner_error_mm()
+        if not reach <= _LIMITS * s.limit_mm:
+            raise self._refused(
+                f"what is seen leaves the corners of the picture {reach:.0f} mm uncertain", count, count
+            )
+        return found
 
     def _refused(self, cause: str, count: int, needed: int) -> NotLocalised:
         return NotLocalised("image", cause, value=count, limit=needed)

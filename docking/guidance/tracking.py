@@ -14,6 +14,8 @@ from docking.guidance.types import ArMap, Image
 from docking.types import Pose
 
 _SAME_PLACE_MM = 1.0
+_REACH_MM, _FASTEST_MM_S = 50.0, 2000.0
+"""A hand-held camera moves slower than this."""
 _LONGEST_GAP_S = 1.0
 """After so long without a pose the last one says nothing about the next."""
 
@@ -49,6 +51,7 @@ class Tracker:
         try:
             features = self.localiser.features(image)
             found = self.localiser.locate(image, features, self._predicted(t_s))
+            self._check_jump(t_s, found)
         except NotLocalised:
             self.counts.losses += int(bool(self._past))
             self._past, self._anchor = [], None
@@ -81,6 +84,16 @@ class Tracker:
         share = (t_s - last_s) / (last_s - before_s) if last_s > before_s else 0.0
         step = before.inverse() @ last
         return last @ Pose(exp_so3(share * log_so3(step.R)), share * step.t_mm)
+
+    def _check_jump(self, t_s: float, found: Localised) -> None:
+        """No hand moves so far between two images: one of the two poses is wrong, and neither is known to be right."""
+        if not self._past or not 0.0 <= t_s - self._past[-1][0] <= _LONGEST_GAP_S:
+            return
+        reach = _REACH_MM + _FASTEST_MM_S * (t_s - self._past[-1][0])
+        moved = float(np.linalg.norm(found.X_WC.t_mm - self._past[-1][1].t_mm))
+        if not moved <= reach:
+            cause = f"it would have jumped by {moved:.0f} mm since the image before"
+            raise NotLocalised("image", cause, value=found.points, limit=found.points)
 
     def _extend(self, seen: Seen) -> None:
         """Grow the map from the anchor and this image, if both see enough that it does not know."""

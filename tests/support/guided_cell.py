@@ -58,7 +58,8 @@ def guided_cell() -> GuidedCell:
     scenery = wall_scenery(3, WALL, X_WP)
     layout = layout_of(scenery)
     camera = SimulatedCamera(scenery.patches, LENS, seed=2)
-    poses = [view(x, z, d, t) for z, d, t in ((950.0, 850.0, 60.0), (1050.0, 750.0, -60.0)) for x in range(0, 1000, 140)]
+    rows = ((950.0, 850.0, 60.0), (1050.0, 750.0, -60.0))
+    poses = [view(x, z, d, t) for z, d, t in rows for x in range(0, 1000, 140)]
     posed = [(Picture(f"{k:04d}", k / 10.0, camera.picture(X)), X) for k, X in enumerate(poses)]
     detector = MarkerDetector.of(layout, CAMERA)
     seen = []
