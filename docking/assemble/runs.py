@@ -188,7 +188,9 @@ def _let_happen(run: _Run, cell: Cell[Procedure], watched: WatchedJournal) -> No
 async def _joined_motion(run: _Run, joined: _Joined, journal: Journal) -> Motion:
     """The motion side in its own process; what it says of itself is kept, and told where it matters."""
     files = run.files
-    fastest_mm_s = max(stage.speed_mm_s for stage in files.job.stages)
+    raised = files.job.level or files.job.lift_mm > 0.0
+    asked = [stage.speed_mm_s for stage in files.job.stages] + [files.job.lift_speed_mm_s] * raised
+    fastest_mm_s = max(asked)
 
     def hear(kind: str, body: Any) -> None:
         if kind == "lateness":
