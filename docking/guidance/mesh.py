@@ -23,7 +23,7 @@ from docking.types import Array
 
 Triangles = NDArray[np.int64]
 MM_PER_M = 1000.0
-_MOST_TRIANGLES, _MOST_NODES = 2_000_000, 100_000
+_MOST_TRIANGLES, _MOST_NODES = 2_000_000, 10_000
 _SHARP = cos(radians(25.0))
 _GLB_MAGIC, _JSON_CHUNK, _BINARY_CHUNK = b"glTF", 0x4E4F534A, 0x004E4942
 _INDEX_TYPES = {5121: np.uint8, 5123: np.uint16, 5125: np.uint32}

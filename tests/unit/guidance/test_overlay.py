@@ -1,0 +1,123 @@
+"""What is drawn lands where it is in the cell, says how sure it is, and is not drawn when it is not sure."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from docking.errors import FontMissing, OverlayUncertain
+from docking.guidance import lettering
+from docking.guidance.lettering import Letters
+from docking.guidance.localiser import Localised
+from docking.guidance.overlay import COLOURS, draw
+from docking.guidance.scene import Line, Mark, PartToPlace, Scene
+from docking.guide_scene import overlay_texts
+from docking.types import Pose
+from sim.scenery import looking
+from tests.support.guided_cell import CAMERA
+
+X_WC = looking(np.array([0.0, 0.0, 0.0]), np.array([100.0, -50.0, 800.0]), 5.0)
+GREY = np.full((480, 640), 128, np.uint8)
+
+
+def found(position_sigma_mm: float = 0.5) -> Localised:
+    cov = np.diag([1e-8, 1e-8, 1e-8, *[position_sigma_mm**2] * 3])
+    return Localised(X_WC, cov, "map", 300, 400, 1.0, 800.0, 0.5, 0.0, CAMERA)
+
+
+def scene(**parts: Any) -> Scene:
+    empty: dict[str, Any] = {"lines": (), "marks": (), "parts": (), "head": (), "steps": ()}
+    return Scene(anchor_mm=np.zeros(3), captions=overlay_texts("en"), **{**empty, **parts})
+
+
+def drawn_at(image: np.ndarray, tone: str) -> np.ndarray:
+    """Pixels (n, 2) x, y of one colour."""
+    rows, columns = np.nonzero(np.all(image == COLOURS[tone], axis=2))  # type: ignore[index]
+    return np.column_stack([columns, rows])
+
+
+def test_a_mark_is_drawn_at_its_projection() -> None:
+    at = np.array([120.0, 80.0, 30.0])
+    image = draw(GREY, found(), scene(marks=(Mark(at, "", "bad"),)), 10.0)
+    pixel = CAMERA.project(X_WC.inverse().apply(at))
+    assert np.allclose(drawn_at(image, "bad").mean(axis=0), pixel, atol=0.8)
+
+
+def test_a_vector_points_to_its_magnified_end() -> None:
+    at, vector = np.array([0.0, 60.0, 0.0]), np.array([0.5, 0.0, 0.0])
+    image = draw(GREY, found(), scene(marks=(Mark(at, "", "next", vector, 200.0, "move"),)), 10.0)
+    tip = CAMERA.project(X_WC.inverse().apply(at + 200.0 * vector))
+    assert np.min(np.linalg.norm(drawn_at(image, "next") - tip, axis=1)) < 2.5
+
+
+def test_a_line_that_begins_behind_the_camera_is_not_drawn_across_the_picture() -> None:
+    behind = X_WC.apply(np.array([[0.0, 0.0, -500.0], [0.0, 0.0, 900.0]]))
+    draw(GREY, found(), scene(lines=(Line(behind, "good"),)), 10.0)
+    sideways = X_WC.apply(np.array([[-4000.0, 0.0, -300.0], [300.0, 0.0, 800.0]]))
+    image = draw(GREY, found(), scene(lines=(Line(sideways, "good"),)), 10.0)
+    assert len(drawn_at(image, "good")) == 0 or drawn_at(image, "good")[:, 0].min() >= 0
+
+
+def test_nothing_is_drawn_where_the_error_could_exceed_the_limit() -> None:
+    good = scene(marks=(Mark(np.zeros(3), "", "good"),))
+    draw(GREY, found(2.0), good, 10.0)
+    with pytest.raises(OverlayUncertain) as refused:
+        draw(GREY, found(6.0), good, 10.0)
+    assert refused.value.value > 10.0
+    with pytest.raises(OverlayUncertain):
+        draw(GREY, found(float("nan")), good, 10.0)
+
+
+def test_what_is_too_far_away_alone_is_left_out_and_counted() -> None:
+    cov = np.diag([4e-6, 4e-6, 4e-6, 0.1, 0.1, 0.1])
+    far = X_WC.apply(np.array([100.0, 50.0, 4000.0]))
+    image = draw(GREY, replace(found(), cov=cov), scene(marks=(Mark(far, "", "bad"),)), 10.0)
+    assert len(drawn_at(image, "bad")) == 0
+    assert len(drawn_at(image, "close")) > 20  # the words that say so
+
+
+def test_a_part_without_a_mesh_shows_its_axes() -> None:
+    part = PartToPlace("bracket", Pose(np.eye(3), np.zeros(3)), None, "next", "")
+    image = draw(GREY, found(), scene(parts=(part,)), 10.0)
+    assert len(drawn_at(image, "next")) > 30
+
+
+def test_every_picture_says_how_good_it_is() -> None:
+    plain, worse = (draw(GREY, found(sigma), scene(), 10.0) for sigma in (0.5, 2.0))
+    head = np.s_[:40, :600]
+    assert np.any(plain[head] != 128)
+    assert np.any(plain[head] != worse[head])
+
+
+def test_chinese_words_are_drawn_or_the_missing_font_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    letters = Letters(20)
+    letters.put(10, 10, "装配", (0, 0, 255))
+    try:
+        image = letters.drawn(np.zeros((60, 200, 3), np.uint8))
+    except FontMissing:
+        pytest.skip("no font with Chinese characters on this machine")
+    boxes = Letters(20)
+    boxes.put(10, 10, "配装", (0, 0, 255))
+    # Two characters, not twice the box of a missing one.
+    assert not np.array_equal(image, boxes.drawn(np.zeros((60, 200, 3), np.uint8)))
+    monkeypatch.setattr(lettering, "FONTS", ())
+    monkeypatch.delenv("DOCKING_FONT", raising=False)
+    lettering.font.cache_clear()
+    try:
+        with pytest.raises(FontMissing):
+            letters.drawn(np.zeros((60, 200, 3), np.uint8))
+    finally:
+        lettering.font.cache_clear()
+
+
+def test_both_catalogues_have_the_same_keys_and_places() -> None:
+    import re
+
+    en, zh = overlay_texts("en"), overlay_texts("zh")
+    assert en.keys() == zh.keys()
+    for key, text in en.items():
+        places = [sorted(set(re.findall(r"{(\w+)", t))) for t in (text, zh[key])]
+        assert places[0] == places[1], key
