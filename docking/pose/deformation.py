@@ -29,8 +29,8 @@ _SMOOTH = 0.6
 _LARGEST = 5e-3
 """Largest amplitude, in the same extents: beyond it is another part."""
 _EVIDENCE = 3.0
-"""By how much the field must be ahead: e^1.5 times as likely. Wrong points of a rigid part are far behind: none of 3300
-drawn sets with mis-aimed or slid points came near."""
+"""By how much the field must be ahead: e^1.5 times as likely. None of 3300 drawn sets with a minority of mis-aimed or
+slid points came near; of those with four wrong points of seven three in a thousand are called deformed."""
 _CHANCE = 1e-5
 """Without any rejected point the rigid fit must be as improbable as this before a field is asked for at all."""
 _NOISE = 1.5
