@@ -18,6 +18,7 @@ from docking.cli_devices import devices, monitor
 from docking.cli_fit import fit, study_pose, study_real, study_screening
 from docking.cli_guide import guide, study_guidance
 from docking.cli_home import home
+from docking.cli_single import single
 from docking.cli_survey import layout, network
 from docking.cli_track import study_tracking, track
 from docking.errors import (
@@ -277,6 +278,7 @@ cli.add_command(layout)
 cli.add_command(guide)
 cli.add_command(devices)
 cli.add_command(home)
+cli.add_command(single)
 cli.add_command(monitor)
 cli.add_command(network)
 

@@ -2,8 +2,8 @@
 
 Which registers these are is a file of `drivers/maps`. Such drives have no common start, no queue and no heartbeat of
 the host: axes that are written one after another are apart by speed x the time between the writes, and one under way
-goes on when the host falls silent. They serve single axes that carry nothing together (a platform, a gate), not a part
-on several of them; no positioner of a cell file is of this kind.
+goes on when the host falls silent. They serve the `single_axes` of a cell, which carry nothing together (a platform, a
+gate), not a part on several of them; no positioner of a cell file is of this kind.
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ from typing import Any
 from docking.assemble.controller import tracker_of
 from docking.assemble.looking import Ends, LookRequest, load_looked_at, wires_of
 from docking.assemble.real_time import run_real
+from docking.assemble.single import look_at_singles
 from docking.assemble.timed import TimedCan, TimedSerial
 from docking.config import CellFile
 from docking.config.cell import CanBus
@@ -50,6 +51,7 @@ def find_devices(request: LookRequest, *, prove: bool = False, watchdogs: bool =
                 skew = await look.start_skew_s()
             finally:
                 look.close()
+            rows += await look_at_singles(cell, ends)
             alone = not any(found.where == STRANGER and found.address == "SYNC" for found in rows)
             if not (prove or watchdogs) or not alone:
                 return _report(cell, rows, skew, _Proof(None if alone or not (prove or watchdogs) else _occupied()))

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from docking.assemble.requests import WireChoice, opened, read_wires
@@ -36,6 +36,8 @@ class Ends:
     serial: SerialLink
     bus: NearBus
     transcript: Transcript | None
+    singles: Mapping[str, str] = field(default_factory=dict)
+    """Where simulated single axes are, by the line in the cell file."""
 
     @property
     def tap(self) -> Callable[[str, bool, bytes], None] | None:
@@ -65,7 +67,9 @@ async def wires_of(request: LookRequest, cell: CellFile) -> AsyncIterator[Ends]:
         if transcript is not None:
             stack.callback(transcript.close)
             serial = TranscribedSerial(serial, transcript, "tracker")
-        yield Ends(port, serial, near_bus(cell, found).transcribed(transcript), transcript)
+        singles = found.get("singles")
+        lines = singles if isinstance(singles, dict) else {}
+        yield Ends(port, serial, near_bus(cell, found).transcribed(transcript), transcript, lines)
 
 
 def load_looked_at(request: LookRequest) -> CellFile:

@@ -114,6 +114,9 @@ def _refuse_real_devices(path: Path, found: dict[str, Any]) -> None:
     far = [host for host in hosts if host not in LOOPBACK]
     ports = [str(found.get(name, "")) for name in ("tracker", "line")]
     far += [port for port in ports if port and not port.startswith("/dev/pts/")]
+    singles = found.get("singles", {})
+    paths = [str(path) for path in singles.values()] if isinstance(singles, dict) else [str(singles)]
+    far += [path for path in paths if not path.startswith("/dev/pts/")]
     far += [path for path in _bus_paths(found) if path and not Path(path).is_socket()]
     if far:
         raise BadArgument("--wires", f"{far[0]} is no simulated device of this machine", value=str(path))

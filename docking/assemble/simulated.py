@@ -27,6 +27,8 @@ from sim.instrument import Instrument
 from sim.plant import Plant
 from sim.plc.group import PlcGroup
 from sim.plc.io_module import IoRegisters, IoServer
+from sim.plc.modbus_rtu import ModbusRtuLine
+from sim.plc.numerical_drive import NumericalAxis
 from sim.trace import AxisTrace
 from sim.tracker.geocom import GeocomStation
 from sim.tracker.line import LineTrackerDevice
@@ -133,6 +135,18 @@ class FarEnd:
             found[module.name] = await server.serve(*((host, 0) if host else (module.host, module.port)))
         return found
 
+    def singles(self, cell: CellFile) -> dict[str, str]:
+        """Let the single axes listen, each line on a pseudo-terminal; where, by line."""
+        found = {}
+        for line in dict.fromkeys(axis.line for axis in cell.single_axes):
+            axes = [axis for axis in cell.single_axes if axis.line == line]
+            wire = PtySerial(self.loop, axes[0].baud)
+            wire.open()
+            units = {axis.unit: NumericalAxis(self.loop.time, axis.v_mm_s) for axis in axes}
+            self.devices += [ModbusRtuLine(units, wire, axes[0].baud, self.loop), wire]
+            found[line] = wire.path
+        return found
+
     def trace(self, path: Path) -> None:
         """Record where the axes are commanded and where they stand. Raises OSError."""
         bus = next(d for d in self.devices if isinstance(d, DriveGroup | PlcGroup))
@@ -192,6 +206,8 @@ async def real_wires(cell: CellFile, far: FarEnd, folder: Path, transcript: Tran
     far.tracker(cell, TranscribedDevice(serial, transcript, "tracker") if transcript is not None else serial)
     far.devices.append(serial)
     found: dict[str, Any] = {"cell": cell.name, "tracker": serial.path}
+    if cell.single_axes:
+        found["singles"] = far.singles(cell)
     if isinstance(cell.bus, ModbusBus) and cell.bus.line is not None:
         return {**found, **await _real_line(cell, cell.bus, far)}
     if isinstance(cell.bus, ModbusBus):

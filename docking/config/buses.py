@@ -6,7 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from docking.config.base import Model, NonNegative, Positive
+from docking.config.base import Finite, Model, Name, NonNegative, Positive
 
 Word32 = Annotated[int, Field(ge=0, le=0xFFFF_FFFF)]
 Turns = Annotated[int, Field(ge=1, le=0xFFFF_FFFF)]
@@ -140,6 +140,23 @@ class ModbusBus(Model):
         if (self.kind == "modbus-rtu") != (self.line is not None):
             raise ValueError("'line' belongs to kind 'modbus-rtu', which needs it")
         return self
+
+
+class SingleAxis(Model):
+    """An axis that carries nothing together with others, behind a drive that moves by numbers (Modbus RTU)."""
+
+    name: Name = Field(description="of the axis, such as platform-left; not that of a positioner")
+    line: str = Field(min_length=1, description="serial port, any pyserial URL; not the line of the positioners")
+    baud: Annotated[int, Field(ge=9600, le=1_000_000)] = Field(default=38400, description="speed of the line, bit/s")
+    framing: Framing = Field(default="8N1", description="data bits, parity (None, Even, Odd), stop bits of a character")
+    unit: Annotated[int, Field(ge=1, le=247)] = Field(description="its unit on the line")
+    map: str = Field(default="iai_numerical", description="map in drivers/maps")
+    stroke_mm: tuple[Finite, Finite] = Field(description="lower and upper end, mm")
+    v_mm_s: Positive = Field(description="largest speed, mm/s")
+    a_mm_s2: Positive = Field(description="acceleration, mm/s^2")
+    timeout_s: Annotated[float, Field(ge=0.01, le=2.0)] = Field(
+        default=0.1, description="longest time one reply may take, s"
+    )
 
 
 class HomingConfig(Model):

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from docking.config.base import Finite, Fraction, Model, Name, NonNegative, PoseVector, Positive, Vector3
-from docking.config.buses import CanBus, DriveIdentity, DriveScale, HomingConfig, ModbusBus
+from docking.config.buses import CanBus, DriveIdentity, DriveScale, HomingConfig, ModbusBus, SingleAxis
 from docking.config.inputs import CanModule, InputsConfig, ModbusModule
 from docking.config.instruments import GeocomConfig, InertialConfig, NdiConfig
 
@@ -27,6 +27,7 @@ __all__ = [
     "Noise",
     "PositionerConfig",
     "SettleConfig",
+    "SingleAxis",
     "TrackerConfig",
 ]
 
@@ -306,6 +307,9 @@ class CellFile(Model):
     limits: LimitsConfig = Field(default=LimitsConfig(), description="where the cell stops or refuses")
     settle: SettleConfig = Field(default=SettleConfig(), description="standstill before measuring")
     motion: MotionConfig = Field(default=MotionConfig(), description="the process that moves the axes")
+    single_axes: tuple[SingleAxis, ...] = Field(
+        default=(), description="axes beside the positioners that carry nothing together with others"
+    )
     homing: HomingConfig | None = Field(
         default=None, description="how the drives find their zero; with it a drive that is not homed is not enabled"
     )

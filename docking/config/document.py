@@ -69,6 +69,7 @@ def cell_document_findings(doc: Document) -> list[Finding]:
         *_addresses(doc),
         *_limits(doc),
         *_load_cells(doc),
+        *_single_axes(doc),
     ]
 
 
@@ -122,6 +123,20 @@ def _addresses(doc: Document) -> list[Finding]:
         missing = [error(f"{key}.unit", "missing: its unit on the line") for key, p in found if p.get("unit") is None]
         return missing + duplicates(entries(doc, "positioners[].unit"), "unit")
     return []
+
+
+def _single_axes(doc: Document) -> list[Finding]:
+    """Axes that carry nothing together: names and units of their own, and never the wire of the positioners."""
+    found = [(key, one) for key, one in entries(doc, "single_axes[]") if isinstance(one, Mapping)]
+    names = [*entries(doc, "positioners[].name"), *((f"{key}.name", one.get("name")) for key, one in found)]
+    units = [(key, (str(one.get("line")), str(one.get("unit")))) for key, one in found]
+    taken = [value for _, value in entries(doc, "bus.line")]
+    shared = [
+        error(f"{key}.line", f"{one['line']!r} is the line of the positioners, which has no time for others")
+        for key, one in found
+        if one.get("line") in taken
+    ]
+    return duplicates(names, "name") + duplicates(units, "line and unit") + shared if found else []
 
 
 def _hashable(address: tuple[Any, ...]) -> bool:

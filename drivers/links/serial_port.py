@@ -137,7 +137,9 @@ class SerialPort:
             return
         self._stopping.set()
         if hasattr(port, "cancel_read"):
-            port.cancel_read()
+            # A reader whose wait ends just now has closed the port already.
+            with contextlib.suppress(*GONE):
+                port.cancel_read()
         thread.join(timeout=5.0 * READ_WAIT_S)
 
     def _read(self, port: serial.Serial, stopping: threading.Event) -> None:

@@ -51,10 +51,12 @@ def on_line(scenario: Callable[[Bench], Awaitable[None]]) -> None:
 
 def test_a_move_is_one_write_and_ends_at_the_target() -> None:
     async def scenario(bench: Bench) -> None:
+        await bench.drives[0].read()
+        began_s = bench.loop.time()
         state = await bench.drives[0].move(-12.34, 50.0, 2.94, 2.0)
         assert state.position_mm == -12.34
         assert bench.axes[1].position_mm == -12.34
-        assert bench.loop.time() == pytest.approx(12.34 / 50.0, abs=0.06)
+        assert bench.loop.time() - began_s == pytest.approx(12.34 / 50.0, abs=0.06)
         writes = [frame for frame in bench.sent if frame[1] == 16]
         # Target -1234, band 5, speed 5000, acceleration 30 (0.30 G), no push, absolute.
         assert [frame[:-2] for frame in writes] == [

@@ -1,0 +1,88 @@
+"""Axes beside the positioners: who answers, and `docking single`, which moves one of them."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import AsyncIterator
+from typing import Any
+
+from docking.assemble.looking import Ends, LookRequest, load_looked_at, wires_of
+from docking.assemble.real_time import run_real
+from docking.config import CellFile
+from docking.config.cell import SingleAxis
+from docking.errors import BadArgument, DockingError
+from drivers.links.serial_port import SerialPort
+from drivers.look import Found
+from drivers.modbus_rtu import RtuLine
+from drivers.numerical_drive import DriveState, NumericalDrive, load_numerical_map
+
+NO_WATCHDOG = "none: it goes on to its target when the controller falls silent"
+MARGIN_S = 2.0
+"""By which a move may outlast its way at its speed."""
+
+
+def move_single(request: LookRequest, name: str, target_mm: float, speed_mm_s: float | None = None) -> dict[str, Any]:
+    """Move one single axis to `target_mm` and wait until it says that it is there.
+
+    Raises BadArgument for an axis or a target that is not in the cell, ConfigError, and as `NumericalDrive.move`.
+    """
+    cell = load_looked_at(request)
+    axis = _axis(cell, name)
+    speed = axis.v_mm_s if speed_mm_s is None else speed_mm_s
+    for what, value, low, high in (("target", target_mm, *axis.stroke_mm), ("speed", speed, 0.0, axis.v_mm_s)):
+        if not (low <= value <= high):
+            raise BadArgument(f"{name}, {what}", f"{low:g} to {high:g}", value=value)
+
+    async def main() -> dict[str, Any]:
+        async with wires_of(request, cell) as ends, _drive(axis, ends) as drive:
+            before = await drive.read()
+            within_s = abs(target_mm - before.position_mm) / speed + speed / axis.a_mm_s2 + MARGIN_S
+            after = await drive.move(target_mm, speed, 1e-3 * axis.a_mm_s2, within_s)
+            return {"axis": name, "before_mm": before.position_mm, "after_mm": after.position_mm, "speed_mm_s": speed}
+
+    return run_real(main, ticks=False)
+
+
+async def look_at_singles(cell: CellFile, ends: Ends) -> list[Found]:
+    """What every single axis says of itself; reads only."""
+    return [await _look(axis, ends) for axis in cell.single_axes]
+
+
+async def _look(axis: SingleAxis, ends: Ends) -> Found:
+    address = f"{axis.line} unit {axis.unit}, {axis.map}"
+    try:
+        async with _drive(axis, ends) as drive:
+            state = await drive.read()
+    except DockingError as error:
+        return Found(f"single axis {axis.name}", address, problem=error)
+    units = f"stands at {state.position_mm:.2f} mm"
+    return Found(f"single axis {axis.name}", address, None, _words(state), units, NO_WATCHDOG)
+
+
+def _words(state: DriveState) -> str:
+    if state.alarm:
+        return f"alarm {state.alarm:#x}"
+    return ", ".join(("servo on" if state.powered else "servo off", "homed" if state.homed else "not homed"))
+
+
+def _axis(cell: CellFile, name: str) -> SingleAxis:
+    known = {axis.name: axis for axis in cell.single_axes}
+    if name not in known:
+        cause = f"one of {', '.join(known)}" if known else "the cell has no [[single_axes]]"
+        raise BadArgument("NAME", cause, value=name)
+    return known[name]
+
+
+@contextlib.asynccontextmanager
+async def _drive(axis: SingleAxis, ends: Ends) -> AsyncIterator[NumericalDrive]:
+    """The drive of an axis, its line open. Raises PortMissing."""
+    served = ends.singles.get(axis.line)
+    # The pseudo-terminal of simulated devices has no parity to set.
+    framing = axis.framing if served is None else "8N1"
+    link = SerialPort(served or axis.line, axis.baud, f"single axis {axis.name}", framing)
+    unit = RtuLine(link, f"single axis {axis.name}", axis.baud, axis.timeout_s).unit(axis.name, axis.unit)
+    await unit.connect()
+    try:
+        yield NumericalDrive(unit, load_numerical_map(axis.map))
+    finally:
+        unit.close()

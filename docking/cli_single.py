@@ -1,0 +1,52 @@
+"""`docking single`: move an axis that stands beside the positioners."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from docking.errors import EXIT_OK, BadArgument
+from docking.terminal import FILE, json_option, print_json, print_text
+
+WARNING = "{name} moves, and goes on when this computer falls silent: it has no watchdog. Everybody clear of it?"
+
+
+@click.command(context_settings={"ignore_unknown_options": True})
+@click.argument("cell", type=FILE)
+@click.argument("name")
+@click.argument("target_mm", type=float)
+@click.option("--speed", type=float, help="mm/s (default: that of the cell file).")
+@click.option("--yes", is_flag=True, help="Do not ask.")
+@click.option("--sim", is_flag=True, help="Move a simulated axis on a real wire.")
+@click.option("--wires", type=FILE, help="Addresses that `docking sim` wrote; without it --sim starts its own devices.")
+@json_option
+def single(
+    cell: Path,
+    name: str,
+    target_mm: float,
+    speed: float | None,
+    yes: bool,
+    sim: bool,
+    wires: Path | None,
+    as_json: bool,
+) -> int:
+    """Move the single axis NAME of a CELL to TARGET_MM: a work platform or a gate, never anything that carries a part.
+
+    \b
+    Example: docking single cell.toml platform-left 250
+    """
+    from docking.assemble.looking import LookRequest
+    from docking.assemble.requests import WireChoice
+    from docking.assemble.single import move_single
+
+    if wires is not None and not sim:
+        raise BadArgument("--wires", "addresses of simulated devices need --sim", value=str(wires))
+    if not (sim or yes):
+        click.confirm(WARNING.format(name=name), abort=True, err=True)
+    report = move_single(LookRequest(cell, WireChoice(sim, wires)), name, target_mm, speed)
+    if as_json:
+        print_json(report)
+    else:
+        print_text("{axis}: from {before_mm:.2f} to {after_mm:.2f} mm".format(**report))
+    return EXIT_OK
