@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tests.bench import (
+    bundle_adjustment,
     can_frames,
     fault_reaction,
     modbus_wire,
@@ -29,4 +30,5 @@ GROUPS: dict[str, Group] = {
     "P10": stop_residual.measure,
     "P11": virtual_time.measure,
     "P12": study.measure,
+    "P17": bundle_adjustment.measure,
 }
