@@ -89,6 +89,8 @@ class NdiLine:
                 return None
         finally:
             self._reply = None
+        # Somebody who gave up may have sent a break, too: its answer would pass for that of the next command.
+        await asyncio.sleep(DRAIN_S)
         await self.okay("INIT")
         return DEFAULT_BAUD
 

@@ -7,6 +7,12 @@ from collections.abc import Awaitable, Callable
 from typing import Any
 
 import numpy as np
+import pytest
+
+from docking.errors import LinkError
+
+
+HEARD_S = 5.0
 
 
 class Stream:
@@ -53,6 +59,38 @@ async def tells_when_each_report_was_taken(stream: Stream) -> None:
     assert all(report.received_s - report.t_s < 0.5 for report in stream.heard)
 
 
+async def refuses_to_start_when_it_is_not_connected(stream: Stream) -> None:
+    with pytest.raises(LinkError) as refused:
+        await stream.sensor.start()
+    assert refused.value.code
+    assert not stream.heard
+
+
+async def closes_at_any_time(stream: Stream) -> None:
+    await stream.sensor.close()
+    await stream.sensor.connect()
+    await stream.sensor.start()
+    await stream.sensor.close()
+    await stream.sensor.close()
+    count = len(stream.heard)
+    await asyncio.sleep(0.3)
+    assert len(stream.heard) == count
+    assert not stream.lost
+
+
+async def survives_a_connect_that_is_given_up(stream: Stream) -> None:
+    task = asyncio.ensure_future(stream.sensor.connect())
+    await asyncio.sleep(0.005)
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    await stream.sensor.close()
+    await stream.sensor.connect()
+    await stream.sensor.start()
+    async with asyncio.timeout(HEARD_S):
+        while not stream.heard:
+            await asyncio.sleep(0.02)
+
+
 async def can_be_started_again_and_joined_again(stream: Stream) -> None:
     await stream.sensor.connect()
     for _ in range(2):
@@ -74,4 +112,7 @@ CHECKS: tuple[Callable[[Stream], Awaitable[None]], ...] = (
     is_silent_until_it_is_started_and_after_it_is_stopped,
     tells_when_each_report_was_taken,
     can_be_started_again_and_joined_again,
+    refuses_to_start_when_it_is_not_connected,
+    closes_at_any_time,
+    survives_a_connect_that_is_given_up,
 )

@@ -1,4 +1,5 @@
-"""The ports of streaming sensors: the same checks on simulated devices in virtual time, over ptys, and on hardware."""
+"""The ports of streaming sensors: the same checks on fakes, on simulated devices in virtual time, over ptys, and on
+hardware."""
 
 from __future__ import annotations
 
@@ -25,6 +26,7 @@ from sim.wires.pty_serial import PtySerial
 from sim.wires.virtual_serial import VirtualSerial
 from tests.conformance.stream_checks import CHECKS, Stream
 from tests.fakes.camera_scene import ROM_A, FakeScene
+from tests.fakes.streams import FakeCamera, FakeInertial
 
 Check = Callable[[Stream], Awaitable[None]]
 
@@ -47,6 +49,17 @@ def _driver(kind: str, link: SpeedLink) -> Any:
 
 @checks
 @kinds
+def test_the_fake(check: Check, kind: str) -> None:
+    async def main() -> None:
+        fake = FakeCamera() if kind == "camera" else FakeInertial()
+        await check(Stream(fake))
+        await fake.close()
+
+    run_virtual(main)
+
+
+@checks
+@kinds
 def test_the_simulated_device_in_virtual_time(check: Check, kind: str) -> None:
     async def main() -> None:
         loop = asyncio.get_running_loop()
@@ -60,17 +73,27 @@ def test_the_simulated_device_in_virtual_time(check: Check, kind: str) -> None:
     run_virtual(main)
 
 
-@checks
+def pty_cases() -> list[Any]:
+    """All checks; those of the camera, which misses the break on a pty and is sought at every speed, in full only."""
+    quick = [pytest.param(check, "inertial", id=f"inertial-{check.__name__}") for check in CHECKS]
+    return quick + [
+        pytest.param(check, "camera", id=f"camera-{check.__name__}", marks=[pytest.mark.full] if n else [])
+        for n, check in enumerate(CHECKS)
+    ]
+
+
+@pytest.mark.parametrize(("check", "kind"), pty_cases())
 @pytest.mark.wires
-async def test_the_simulated_inertial_sensor_over_a_pty(check: Check) -> None:
+async def test_the_simulated_device_over_a_pty(check: Check, kind: str) -> None:
     loop = asyncio.get_running_loop()
-    terminal = PtySerial(loop, 115200)
+    terminal = PtySerial(loop, BAUD[kind])
     terminal.open()
-    device = _device("inertial", terminal, loop)
-    sensor = _driver("inertial", SerialPort(terminal.path, 115200, "inertial sensor"))
+    device = _device(kind, terminal, loop)
+    sensor = _driver(kind, SerialPort(terminal.path, BAUD[kind], kind))
     await check(Stream(sensor))
     await sensor.close()
-    device.close()
+    if kind == "inertial":
+        device.close()
     terminal.close()
 
 
