@@ -80,8 +80,15 @@ class SerialPort:
     async def open(self) -> None:
         """Open the port, alone; PortMissing with the reason in words."""
         self._loop = asyncio.get_running_loop()
+        opening = asyncio.ensure_future(asyncio.to_thread(self._open_port))
         try:
-            port = await asyncio.to_thread(self._open_port)
+            port = await asyncio.shield(opening)
+        except asyncio.CancelledError:
+            # The thread cannot be told to leave off: what it opens is held by nobody, and nobody else could open it.
+            (opened,) = await asyncio.gather(opening, return_exceptions=True)
+            if not isinstance(opened, BaseException):
+                opened.close()
+            raise
         except (*GONE, ValueError) as error:
             raise PortMissing(self._name, _words(error), value=self._url) from error
         self._stopping = threading.Event()
