@@ -34,7 +34,7 @@ def measure(sizes: Sizes) -> list[Metric]:
     held[:: max(1, len(held) // 6)] = True
     bundle = bundle_of(ar_map, held)
     works: dict[str, Any] = {"product": lambda: adjust(bundle, 50, SAME_STOP)}
-    peer = _Peer.of(ar_map, held, sizes.repeats)
+    peer = peer_of(ar_map, held, sizes.repeats)
     if peer is not None:
         works["peer"] = peer.solve
     times = side_by_side(works, sizes.repeats)
@@ -93,15 +93,6 @@ class _Peer:
         ceres.solver_options.num_threads = 1
         ceres.solver_options.function_tolerance = SAME_STOP
 
-    @staticmethod
-    def of(ar_map: ArMap, held: np.ndarray, turns: int) -> _Peer | None:
-        """None where the extra is not installed."""
-        try:
-            import pycolmap
-        except ImportError:
-            return None
-        return _Peer(pycolmap, ar_map, held, turns)
-
     def solve(self) -> Any:
         """Build and solve, from the same start every time; the adjusted model. Once for every turn."""
         model = self.models.pop()
@@ -113,3 +104,12 @@ class _Peer:
         adjuster = self.pycolmap.create_default_bundle_adjuster(self.options, config, model)
         adjuster.solve()
         return model
+
+
+def peer_of(ar_map: ArMap, held: np.ndarray, turns: int) -> _Peer | None:
+    """None where the extra is not installed."""
+    try:
+        import pycolmap
+    except ImportError:
+        return None
+    return _Peer(pycolmap, ar_map, held, turns)
