@@ -180,7 +180,7 @@ class InertialTracker:
         square = np.zeros((3, 3))
         nav = core.Navigation(t_s, p, zero, C, zero, zero, 0.0, square, square, zero)
         sd = np.zeros(self._layout.size)
-        sd[P] = 3.0 * np.sqrt(np.trace(frame.cov_mm2[0])) + np.linalg.norm(self._arms_I[at]) * 0.1
+        sd[P] = 3.0 * np.sqrt(np.trace(frame.cov_mm2[0])) + np.linalg.norm(self._arms_I[at]) * 0.1 + s.lever_sd_mm
         sd[V] = self._start.velocity_sd_mm_s if self._start else 100.0
         sd[BA], sd[BG] = self._model.force_bias * MM_PER_M, self._model.rate_bias
         for place, value in (
@@ -405,13 +405,13 @@ class InertialTracker:
         assert settings is not None
         for block, value, sd in (
             (V, None, settings.velocity_sd_mm_s),
-            (BG, still.rate, settings.rate_noise_rad_s),
+            (BG, still.rate, settings.rate_excess * self._model.rate_density / np.sqrt(settings.window_s)),
         ):
             head = self._head
             assert head is not None
             residual = -head.nav.v_mm_s if value is None else value - head.nav.rate_bias
             s = head.cov[block, block] + sd * sd * np.eye(3)
-            if float(residual @ np.linalg.solve(s, residual)) <= self._s.gate:
+            if float(residual @ np.linalg.solve(s, residual)) <= settings.gate:
                 rows = np.zeros((3, self._layout.size))
                 rows[:, block] = np.eye(3)
                 dx, cov = core.taken_in(head.cov, rows, residual, sd * sd * np.eye(3))

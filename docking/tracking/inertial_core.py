@@ -152,7 +152,9 @@ class Propagation:
         # phi grows by -C b_g t meanwhile, so half of it has acted on the velocity, a third of that on the way
         phi[V, BG], phi[P, BG] = (0.5 * dt) * (slope @ C), (dt / 3.0) * (way @ C)
         if self._layout.scale is not None:
-            phi[PHI, self._layout.scale] = np.multiply.outer(C, since.angle_rad).reshape(3, 9)
+            turned = np.multiply.outer(C, since.angle_rad).reshape(3, 9)
+            phi[PHI, self._layout.scale] = turned
+            phi[V, self._layout.scale], phi[P, self._layout.scale] = -0.5 * slope @ turned, (-1.0 / 3.0) * way @ turned
         if self._layout.force_scale is not None:
             gained = np.multiply.outer(C, since.push_mm_s).reshape(3, 9)
             phi[V, self._layout.force_scale], phi[P, self._layout.force_scale] = gained, (0.5 * dt) * gained

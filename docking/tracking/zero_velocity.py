@@ -19,13 +19,15 @@ _ROOM = 4096
 
 @dataclass(frozen=True)
 class ZeroVelocity:
-    """Settings: window, largest sd of force and rate in it as a multiple of the sensor's noise, and the sd of the
-    pseudo measurements of velocity and of the rate that is taken for bias."""
+    """Settings: window; largest sd of force and rate in it as a multiple of the sensor's noise; sd of the pseudo
+    measurement of velocity; that of the rate taken for bias, as a multiple of the noise of its mean, since windows
+    overlap; and the gate, largest squared Mahalanobis distance, that both must pass."""
 
     window_s: float = 0.25
-    noise_ratio: float = 1.6
+    noise_ratio: float = 1.3
     velocity_sd_mm_s: float = 2.0
-    rate_noise_rad_s: float = 0.002
+    rate_excess: float = 3.5
+    gate: float = 11.0
     every_s: float = 0.02
 
 
