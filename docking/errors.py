@@ -260,6 +260,14 @@ class BrakeDisagrees(MotionError):
     code = 2144
 
 
+class LiveDeviation(MotionError):
+    code = 2151
+
+
+class PoseUncertain(MotionError):
+    code = 2152
+
+
 # 3xxx measuring and fitting --------------------------------------------------------------------------------------
 class PoseError(DockingError):
     """Measuring and fitting. `rejected` holds what the screening had found out about single points when it refused."""

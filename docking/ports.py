@@ -242,6 +242,11 @@ class Motion(Protocol):
         Raises BadArgument outside 0 to 100, and nothing changes."""
         ...
 
+    def stop_for(self, error: DockingError) -> None:
+        """Stop the running move on its path because of what was found outside the motion side, a LiveDeviation or a
+        PoseUncertain; kept as the fault that ended it. Never waits; without effect when no move runs."""
+        ...
+
     def feedback(self) -> Feedback:
         """The newest read-back. Raises the fault that the motion side holds until it is reset."""
         ...

@@ -107,6 +107,8 @@ _POWERED: dict[Trigger, tuple[Reaction, Reaction, Reaction]] = {
     Trigger.PROTECTIVE_STOP: (_N, _P, _P),
     Trigger.INPUTS_SILENT: (_N, _P, _P),
     Trigger.BRAKE: (_N, _F, _F),
+    Trigger.LIVE_DEVIATION: (_N, _P, _P),
+    Trigger.POSE_UNCERTAIN: (_N, _P, _P),
     Trigger.OPERATOR_STOP: (Reaction.REJ, _P, _P),
     Trigger.DEFECT: (_S, _S, _S),
     Trigger.STOP_OVERDUE: (_S, _S, _S),

@@ -34,7 +34,7 @@ class LeaseSettings:
 class RemoteMotion:
     """`docking.ports.Motion` over a channel; renews the lease from `connect` to `close`.
 
-    `tell(what, body)` hears `hello`, `lateness` and `said` of the motion side. `explain(reason)` is called when it is
+    `on_feedback` hears every read-back when it comes. `tell(what, body)` hears `hello`, `lateness` and `said` of the motion side. `explain(reason)` is called when it is
     gone: it makes sure of that and says how it ended.
     """
 
@@ -48,6 +48,7 @@ class RemoteMotion:
     ) -> None:
         self.axes = axes
         self.speed_limit_mm_s = math.inf
+        self.on_feedback: Callable[[Feedback], None] = lambda feedback: None
         self._channel, self._settings, self._tell, self._explain = channel, settings, tell, explain
         self._loop = asyncio.get_running_loop()
         self._numbers = itertools.count(1)
@@ -101,6 +102,11 @@ class RemoteMotion:
         else:
             # A hold that comes before the start counts from the first set-point on.
             self._early.append(verb)
+
+    def stop_for(self, error: DockingError) -> None:
+        """Stop the running move on its path; the motion side judges and keeps the error."""
+        if self._move:
+            self._channel.send(encode("stop_for", self._move, error))
 
     def override(self, percent: float) -> None:
         """Run plans at 0 to 100 % of their speed from now on. Raises BadArgument outside, and nothing changes."""
@@ -169,8 +175,10 @@ class RemoteMotion:
         if kind == "still":
             if self._feedback is not None:
                 self._feedback = replace(self._feedback, t_s=payload)
+                self.on_feedback(self._feedback)
         elif kind == "feedback":
             self._feedback, self._held = payload, None
+            self.on_feedback(payload)
         elif kind == "inputs":
             self._inputs = payload
         elif kind == "held":

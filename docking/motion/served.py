@@ -12,7 +12,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, fields
 from typing import Any, Protocol, runtime_checkable
 
-from docking.errors import BadReply, DockingError, LeaseLost
+from docking.errors import BadReply, DockingError, LeaseLost, LiveDeviation, PoseUncertain
 from docking.motion.arbiter import Arbiter
 from docking.motion.channel import Channel
 from docking.motion.lateness import Lateness, speed_limit_mm_s
@@ -22,6 +22,11 @@ from docking.types import Array, Feedback, Identity, InputState, MoveResult, Pla
 
 STOP_S = 30.0
 """Longest wait for a move to stop on its path before the wires are released without it."""
+FOUND_OUTSIDE: dict[type[DockingError], Trigger] = {
+    LiveDeviation: Trigger.LIVE_DEVIATION,
+    PoseUncertain: Trigger.POSE_UNCERTAIN,
+}
+"""What the cell process may ask a stop for."""
 CALLS = ("connect", "enable", "load", "start", "reset", "close")
 
 
@@ -122,6 +127,9 @@ class ServedMotion:
             # A verb for a move that has ended meanwhile would hold or stop the next one.
             if number in self._calls:
                 self._motion.request(payload)
+        elif kind == "stop_for":
+            if number in self._calls:
+                self._motion.report(Finding(FOUND_OUTSIDE[type(payload)], payload))
         elif kind == "override":
             self._motion.override(payload)
         elif kind == "cancel":

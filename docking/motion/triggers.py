@@ -41,6 +41,8 @@ class Trigger(Enum):
     PROTECTIVE_STOP = "a gate or scanner asks for a stop"
     INPUTS_SILENT = "a module of inputs is silent"
     BRAKE = "a brake closes in a move"
+    LIVE_DEVIATION = "the part is not where the plan has it"
+    POSE_UNCERTAIN = "where the part is in its move is not known well enough"
     OPERATOR_STOP = "the operator asks for a stop"
     DEFECT = "an error of the program itself"
     STOP_OVERDUE = "a stop on the path has not ended in time"
