@@ -194,7 +194,7 @@ class Misalignment(Model):
 
 class Drives(Model):
     """Servo drives and brakes as they really are; drives on CAN react as `sync_loss` says to `sync_loss_cycles` without
-    SYNC, and have these `modes` of operation. `follower_friction` is of the force that a force-controlled axis holds."""
+    SYNC, and have these `modes`. `follower_friction` is of the force that a force-controlled axis holds."""
 
     servo_lag_s: Positive
     servo_lag_spread: NonNegative

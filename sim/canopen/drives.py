@@ -114,8 +114,8 @@ class Drives:
         self._start, self._goal = self._now, goal
 
     def stay(self) -> None:
-        """A SYNC without anything different: the line to the goal is finished."""
-        self._start = self._goal = self._now
+        """A SYNC without anything different: the goal stays, also for a SYNC that came early."""
+        self._start = self._now
 
     def coast(self, t_s: float, dt_s: float, standing_mm: Callable[[], Array]) -> Array:
         """Set-points of a step that the drives take on their own, without SYNC."""

@@ -298,3 +298,16 @@ def test_bus_time_and_arbitration() -> None:
         assert heard[2][0] - start == pytest.approx(first + 55 / 500_000)
 
     run_virtual(main)
+
+
+def test_a_sync_that_comes_early_and_says_nothing_takes_no_way_off() -> None:
+    async def scenario(raw: Raw) -> None:
+        await enabled(raw)
+        drives, here = raw.bench.drives.drives, raw.bench.plant.encoder_mm
+        stood = float(here()[0])
+        drives.latch(np.array([0]), np.array([stood + 0.1]))
+        assert drives.advance(0.0, 0.004, 0.004, here)[0] == pytest.approx(stood + 0.04)
+        drives.stay()
+        assert drives.advance(0.0, 0.010, 0.010, here)[0] == pytest.approx(stood + 0.1)
+
+    run(scenario)
