@@ -6,6 +6,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,6 +33,8 @@ LINE = {
     "segment_s": 0.1,
     "watchdog_s": 0.5,
 }
+IN_REAL_TIME = {"timeout_s": 0.3, "watchdog_s": 1.0}
+"""Devices and driver share a computer with other work: either may be kept from it for a while."""
 UNCUT = {"tells_a_broken_connection_at_once"}
 """A line has no connections."""
 
@@ -83,13 +86,32 @@ def test_the_simulated_controllers_in_virtual_time(check: Check, kind: str) -> N
     run_virtual(main)
 
 
-@checks
-@kinds
+QUICK_ON_A_LINE = {
+    "says_who_is_there_and_enables_nothing",
+    "survives_calls_that_are_given_up",
+    "plays_a_plan_to_its_end",
+}
+
+
+def wired_cases() -> list[Any]:
+    """All checks on both wires; on the slow one in real time a few, the others in full only."""
+    return [
+        pytest.param(
+            check,
+            kind,
+            id=f"{kind}-{check.__name__}",
+            marks=[pytest.mark.full] if kind == "rtu" and check.__name__ not in QUICK_ON_A_LINE else [],
+        )
+        for kind in ("tcp", "rtu")
+        for check in CHECKS
+        if not (kind == "rtu" and check.__name__ in UNCUT)
+    ]
+
+
+@pytest.mark.parametrize(("check", "kind"), wired_cases())
 @pytest.mark.wires
 async def test_the_simulated_controllers_over_real_wires(check: Check, kind: str) -> None:
-    if kind == "rtu" and check.__name__ in UNCUT:
-        pytest.skip("a serial line has no connections to break")
-    cell_file = cell(**LINE) if kind == "rtu" else cell()
+    cell_file = cell(**(LINE | IN_REAL_TIME)) if kind == "rtu" else cell(**IN_REAL_TIME)
     group = _group(cell_file)
     terminal = PtySerial(asyncio.get_running_loop(), BAUD)
     try:
