@@ -63,7 +63,8 @@ def _bad(path: Path, value: object, cause: str) -> NoReturn:
 def _read(path: Path, parts: _Parts, sigma_mm: float) -> None:
     try:
         size = path.stat().st_size
-        head = path.open("rb").read(4096)
+        with path.open("rb") as file:
+            head = file.read(4096)
     except OSError as error:
         raise FileUnreadable(str(path), error.strerror or type(error).__name__) from error
     if size > _MOST_BYTES:

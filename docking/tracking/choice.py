@@ -4,8 +4,10 @@ The covariance of a free INS position after t seconds (constant attitude and for
 
     S(t) = (t^2/2)^2 C Sa C^T + (t^3/6)^2 [Cf]x C Sg C^T [Cf]x^T + (t^2/2)^2 [Cf]x Sth [Cf]x^T
 
-r_ij = S_ij / sqrt(S_ii S_jj). The rule as printed: coupled where any r is not 0. With estimates r is never 0 and says
-nothing about size; the better rule asks in addition whether the coupled form would be less uncertain after the gap.
+r_ij = S_ij / sqrt(S_ii S_jj). The rule as printed: coupled where any r is not 0. With estimates r is never 0, so a
+threshold stands for 0; and it is free of scale: a level sensor with like biases has r = 0 although its unknown rate
+bias costs most of the accuracy. What decides here is whether the coupled form would be less uncertain after the gap;
+r and the verdict of the printed rule are told beside it.
 """
 
 from __future__ import annotations
@@ -49,11 +51,12 @@ def largest_r(cov_mm2: Array) -> float:
 
 
 class Choice(NamedTuple):
-    """`method` and the figures that led to it: `r` largest correlation, predicted sd of both forms after the gap (mm),
-    `why` in words."""
+    """`method` and the figures that led to it: `r` largest correlation and the form that the printed rule picks by it,
+    predicted sd of both forms after the gap (mm), `why` in words."""
 
     method: str
     r: float
+    printed_rule: str
     decoupled_sd_mm: float
     coupled_sd_mm: float
     why: str
@@ -67,7 +70,7 @@ def choose(recording: Recording, model: InertialModel, gap_s: float) -> Choice:
     """Which method bridges gaps of `gap_s` best, as predicted before anything is run."""
     nan = float("nan")
     if len(recording.encoder_t_s):
-        return Choice("encoders", nan, nan, nan, "encoders bridge a gap better than any inertial sensor")
+        return Choice("encoders", nan, "", nan, nan, "encoders bridge a gap better than any inertial sensor")
     start = start_of(recording)
     C = (np.eye(3) if start is None else start.R_WB) @ recording.body.X_BI.R
     tilt, heading = (0.01, 0.05) if start is None else (start.tilt_sd_rad, start.heading_sd_rad)
@@ -78,11 +81,10 @@ def choose(recording: Recording, model: InertialModel, gap_s: float) -> Choice:
     )
     r = largest_r(ins_cov_mm2(C, force, loose, gap_s))
     decoupled, coupled = predicted_sd_mm(model, gap_s)
-    better = r > LEAST_R and coupled < LEAST_GAIN * decoupled
-    why = (
-        f"|r| {r:.2f} against {LEAST_R}, predicted sd after {gap_s:g} s: {decoupled:.3g} mm decoupled, {coupled:.3g} mm"
-    )
-    return Choice("ins" if better else "repaired", r, decoupled, coupled, why + " coupled")
+    better, printed = coupled < LEAST_GAIN * decoupled, "coupled" if r > LEAST_R else "decoupled"
+    sizes = f"{decoupled:.3g} mm decoupled, {coupled:.3g} mm coupled"
+    why = f"predicted sd after {gap_s:g} s: {sizes}; |r| {r:.2f}: {printed} by the printed rule"
+    return Choice("ins" if better else "repaired", r, printed, decoupled, coupled, why)
 
 
 def predicted_sd_mm(model: InertialModel, gap_s: float) -> tuple[float, float]:

@@ -117,7 +117,7 @@ def test_a_lever_arm_is_estimated() -> None:
 
 def test_the_smoother_knows_what_came_after_the_gap() -> None:
     recording, truth, _ = record(POINT, 21.0, "mems", 7)
-    gaps = every(recording, 10.0, 3.0)[:1] + [Gap(15.0, 3.0)]
+    gaps = [*every(recording, 10.0, 3.0)[:1], Gap(15.0, 3.0)]
     hide = hidden(recording, gaps)
     tracker = InertialTracker(POINT, GRADES["mems"], start_of(recording), tape=Tape())
     causal = play(recording, tracker, hide)
