@@ -14,6 +14,7 @@ from tests.bench import (
     study,
     tick_lateness,
     tracker_frames,
+    tracking,
     virtual_time,
 )
 from tests.bench.metric import Group
@@ -30,5 +31,6 @@ GROUPS: dict[str, Group] = {
     "P10": stop_residual.measure,
     "P11": virtual_time.measure,
     "P12": study.measure,
+    "P13": tracking.measure,
     "P17": bundle_adjustment.measure,
 }
