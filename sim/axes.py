@@ -62,6 +62,7 @@ class AxisBank:
         self._play: Array = self.motor_mm.copy()
         self._half: Array = 0.5 * truth.backlash_mm
         self._first_stick = truth.stick_mm[0].copy()
+        self.slip_mm: Array = np.zeros(count)
         self.still = True
         self.jammed: BoolArray = np.zeros(count, dtype=bool)
         self._dragged_mm_s: Array = np.zeros(count)
@@ -86,9 +87,9 @@ class AxisBank:
         return result
 
     def load_mm(self) -> Array:
-        """Socket position along each axis (m,): lead, backlash, wander and stick-slip added to the motor's."""
+        """Socket position along each axis (m,): lead, backlash, wander, stick-slip and slip added to the motor's."""
         stick = self.truth.stick_mm[self._stops % _STOPS] - self._first_stick
-        result: Array = self._play + self.truth.lead * self.motor_mm + self._wander() + stick
+        result: Array = self._play + self.truth.lead * self.motor_mm + self._wander() + stick + self.slip_mm
         return result
 
     def step(self, dt_s: float, target_mm: Array, powered: BoolArray, braked: BoolArray) -> bool:

@@ -98,6 +98,7 @@ class FaultBook:
             if driven:
                 self._add(axis, "creep", Fault(partial(plant.creep, axis), free))
                 self._add(axis, "weaken", Fault(partial(plant.weaken, axis)))
+                self._add(axis, "slip", _healed(partial(plant.slip, axis), by_mm=0.0))
                 self._add(axis, "displace", Fault(partial(plant.displace, axis)))
             else:
                 self._add(axis, "lose_ball", Fault(partial(plant.lose_ball, axis)))

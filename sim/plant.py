@@ -235,6 +235,11 @@ class Plant:
         self._encoder = None
         self._stale_steps += 1
 
+    def slip(self, axis: str, by_mm: float) -> None:
+        """Let the socket of a driven axis give way by so much against its encoder, which does not see it."""
+        self._bank.slip_mm[self._driven(axis)] = by_mm
+        self._stale_steps += 1
+
     def creep(self, axis: str, speed_mm_s: float) -> None:
         """Let a driven axis move whatever its servo and brake want: drift, slipping brake, runaway."""
         self._bank.seize(self._driven(axis), True, speed_mm_s)

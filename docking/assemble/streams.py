@@ -7,6 +7,7 @@ from pathlib import Path
 
 from docking.assemble.simulated import FarEnd
 from docking.config import CellFile, JobFile
+from docking.config.base import PoseVector
 from docking.config.instruments import NdiConfig
 from docking.errors import BadArgument, FileUnreadable
 from docking.ports import InertialSensor, PointStream, SerialLink, SpeedLink
@@ -15,11 +16,12 @@ from drivers.ndi_line import DEFAULT_BAUD
 from drivers.ndi_stream import NdiStream
 from drivers.vectornav import VectorNav
 from sim.tracker.ndi import NdiCamera
-from sim.tracker.plant_scene import PlantScene, component_pose
+from sim.tracker.plant_scene import PlantScene, mounted_pose
 from sim.tracker.vectornav import VectorNavSensor
 from sim.wires.pacing import DeviceEnd, SpeedEnd
 
 CAMERA, INERTIAL = "camera", "inertial sensor"
+LEVEL = (0.0, 0.0, 0.0, 180.0, 0.0, 0.0)
 PLUGGED = "component"
 """The simulated camera has this tool on its port when none is configured."""
 
@@ -43,21 +45,23 @@ def inertial_of(cell: CellFile, link: SerialLink | None = None) -> InertialSenso
 
 
 def simulated_camera(cell: CellFile, job: JobFile, folder: Path, far: FarEnd, wire: SpeedEnd) -> NdiCamera:
-    """A camera before the plant of `far`: all its tools ride on the component."""
+    """A camera before the plant of `far`: all its tools ride on the component, where `[live]` has them."""
     config = _camera(cell)
     roms = {rom: name for name, rom in _definitions(config, folder).items()}
     plugged = () if roms else (PLUGGED,)
     markers = tuple(target.name for target in job.component.targets)
-    scene = PlantScene(far.plant, config.station_pose, (*roms.values(), *plugged), markers)
+    places = {point.name: point.at_mm for point in cell.live.points} if cell.live is not None else {}
+    tools = {name: places.get(name, (0.0, 0.0, 0.0)) for name in (*roms.values(), *plugged)}
+    scene = PlantScene(far.plant, config.station_pose, tools, markers)
     camera = NdiCamera(scene, wire, far.loop, roms, plugged, far.seed)
     camera.rate_hz = config.rate_hz
     far.devices.append(camera)
     return camera
 
 
-def simulated_inertial(far: FarEnd, wire: DeviceEnd) -> VectorNavSensor:
-    """An inertial sensor on the component of `far`."""
-    sensor = VectorNavSensor(partial(component_pose, far.plant), wire, far.loop, far.seed)
+def simulated_inertial(far: FarEnd, wire: DeviceEnd, mount: PoseVector = LEVEL) -> VectorNavSensor:
+    """An inertial sensor on the component of `far`, its own axes at `mount` in the component frame."""
+    sensor = VectorNavSensor(partial(mounted_pose, far.plant, mount), wire, far.loop, far.seed)
     far.devices.append(sensor)
     return sensor
 

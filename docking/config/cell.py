@@ -11,6 +11,7 @@ from docking.config.base import Finite, Fraction, Model, Name, NonNegative, Pose
 from docking.config.buses import CanBus, DriveIdentity, DriveScale, HomingConfig, ModbusBus, SingleAxis
 from docking.config.inputs import CanModule, InputsConfig, ModbusModule
 from docking.config.instruments import GeocomConfig, InertialConfig, NdiConfig
+from docking.config.live import LiveConfig
 
 __all__ = [
     "AxisConfig",
@@ -297,6 +298,7 @@ class CellFile(Model):
     tracker: TrackerConfig = Field(description="the instrument")
     camera: NdiConfig | None = Field(default=None, description="a camera that streams beside the instrument")
     inertial: InertialConfig | None = Field(default=None, description="an inertial sensor on the component")
+    live: LiveConfig | None = Field(default=None, description="with it the part is followed in every move")
     bus: CanBus | ModbusBus = Field(discriminator="kind", description="the wire to the axes")
     positioners: tuple[PositionerConfig, ...] = Field(min_length=3, description="in the order of all axis lists")
     load_cells: LoadCellConfig | None = Field(
@@ -317,6 +319,13 @@ class CellFile(Model):
     inputs: InputsConfig | None = Field(
         default=None, description="inputs that are wired; without them the operator declares the permissives"
     )
+
+    @model_validator(mode="after")
+    def _live_needs_a_camera(self) -> Self:
+        """Nothing but a camera sees what the encoders do not."""
+        if self.live is not None and self.camera is None:
+            raise ValueError("[live] needs a [camera]")
+        return self
 
     @property
     def axis_names(self) -> tuple[str, ...]:

@@ -81,6 +81,10 @@ class InertialConfig(Model):
         description="VNYMR: attitude and compensated measurements; VNIMU: calibrated measurements without filter",
     )
     rate_hz: Literal[1, 2, 4, 5, 10, 20, 25, 40, 50, 100, 200] = Field(default=50, description="samples a second")
+    mount_pose: PoseVector = Field(
+        default=(0.0, 0.0, 0.0, 180.0, 0.0, 0.0),
+        description="pose of the sensor's own axes in the component frame, mm and deg; as it is: z down, at its origin",
+    )
 
     @model_validator(mode="after")
     def _fits_the_line(self) -> Self:

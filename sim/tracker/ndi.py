@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from sim.tracker.crc import checksum
 from sim.tracker.faults import FaultySender, WireFaults
@@ -42,6 +42,14 @@ class NdiFaults(WireFaults):
     """commands that are answered by OKAY and not carried out"""
     frozen: bool = False
     """the exposures stand still"""
+    stale: bool = False
+    """the exposures count up and show what the one before them showed"""
+    occluded: bool = False
+    """nothing is seen: no tool, no marker"""
+    swapped: dict[str, str] = field(default_factory=dict)
+    """tool -> the tool whose place it is told at"""
+    shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """added to every place, in the camera's frame: somebody has pushed it"""
     system_status: int = 0
     """bits of the system status"""
 
@@ -251,19 +259,23 @@ class NdiCamera:
             raise Refused(0x23)
         number = int((self._loop.time() - self._on_since_s) * self.rate_hz) + 1
         if number != self._last.number and not self.faults.frozen:
-            self._last = expose(self._scene, number, self._loop.time(), self.noise_mm, self._seed)
+            seen = expose(self._scene, number, self._loop.time(), self.noise_mm, self._seed)
+            self._last = Exposure(number, self._last.tools, self._last.strays_mm) if self.faults.stale else seen
         listed = {key: handle for key, handle in self._handles.items() if handle.status & INITIALISED}
         tools = "".join(self._tool(key, handle) for key, handle in listed.items())
-        strays = stray_text(self._last.strays_mm) if options & 0x1000 else ""
+        markers = [] if self.faults.occluded else [row + self.faults.shift_mm for row in self._last.strays_mm]
+        strays = stray_text(markers) if options & 0x1000 else ""
         return f"{len(listed):02X}{tools}{strays}{self.faults.system_status:04X}"
 
     def _tool(self, key: str, handle: _Handle) -> str:
         if not handle.status & ENABLED:
             return f"{key}DISABLED{handle.status:08X}{self._last.number:08X}\n"
-        seen = self._last.tools.get(handle.tool)
-        if seen is None or handle.tool in self.faults.missing:
+        faults = self.faults
+        seen = self._last.tools.get(faults.swapped.get(handle.tool, handle.tool))
+        if seen is None or faults.occluded or handle.tool in faults.missing:
             return f"{key}MISSING{handle.status:08X}{self._last.number:08X}\n"
-        status = handle.status | (0x40 if handle.tool in self.faults.outside else 0)
+        seen = replace(seen, p_mm=seen.p_mm + faults.shift_mm)
+        status = handle.status | (0x40 if handle.tool in faults.outside else 0)
         return f"{key}{tool_text(seen)}{status:08X}{self._last.number:08X}\n"
 
 

@@ -46,6 +46,11 @@ class InertialErrors:
     rate_bias_rad_s: tuple[float, float, float] = (1e-4, -5e-5, 2e-5)
     rate_noise_rad_s: float = 5e-4
     clock_ppm: float = 20.0
+    scale: float = 0.0
+    misalignment_rad: float = 0.0
+    late_s: float = 0.0
+    """`scale` by which force and rate are too large; turn of the sensor about (1, 1, 1) against its stated mounting;
+    by how much its stamps are later than what it felt"""
 
 
 @dataclass
@@ -84,6 +89,7 @@ class VectorNavSensor:
         }
         self._on_since_s = loop.time()
         self._felt: deque[tuple[float, Array, Array]] = deque()
+        self._filtered: deque[tuple[float, tuple[float, ...]]] = deque()
         self._values: tuple[float, ...] = ()
         wire.on_bytes = self._receive
         self._next_s = loop.time()
@@ -187,7 +193,10 @@ class VectorNavSensor:
     def _sample(self, kind: str, now_s: float) -> str:
         rotation = self._felt[-1][1] @ TO_SENSOR
         if not (self.faults.frozen and self._values):
-            self._values = self._measure(rotation)
+            self._filtered.append((now_s, self._measure(rotation)))
+            while len(self._filtered) > 1 and self._filtered[1][0] <= now_s - self.errors.late_s:
+                self._filtered.popleft()
+            self._values = self._filtered[0][1]
         force, rate = self._values[:3], self._values[3:]
         field_gauss = rotation.T @ np.array([0.25, 0.0, -0.4])
         numbers = [*force, *rate]
@@ -210,8 +219,9 @@ class VectorNavSensor:
     def _measure(self, rotation: Array) -> tuple[float, ...]:
         """Specific force and turning rate (6,) in the sensor's axes, with its errors."""
         errors = self.errors
-        force = rotation.T @ (self._acceleration_m_s2() - GRAVITY_W) + np.array(errors.force_bias_m_s2)
-        rate = TO_SENSOR.T @ self._rate_rad_s() + np.array(errors.rate_bias_rad_s)
+        wrong = (1.0 + errors.scale) * _turned(errors.misalignment_rad)
+        force = wrong @ rotation.T @ (self._acceleration_m_s2() - GRAVITY_W) + np.array(errors.force_bias_m_s2)
+        rate = wrong @ TO_SENSOR.T @ self._rate_rad_s() + np.array(errors.rate_bias_rad_s)
         force = force + errors.force_noise_m_s2 * self._rng.standard_normal(3)
         rate = rate + errors.rate_noise_rad_s * self._rng.standard_normal(3)
         return tuple(float(v) for v in (*force, *rate))
@@ -232,6 +242,12 @@ class VectorNavSensor:
             return np.zeros(3)
         rate: Array = Rotation.from_matrix(first.T @ last).as_rotvec() / (last_s - first_s)
         return rate
+
+
+def _turned(angle_rad: float) -> Array:
+    """(3, 3): what a sensor turned by `angle_rad` about (1, 1, 1) shows of a vector in its stated axes."""
+    result: Array = Rotation.from_rotvec(-angle_rad / np.sqrt(3.0) * np.ones(3)).as_matrix()
+    return result
 
 
 def _numbers(values: Array | list[float], digits: int) -> str:
