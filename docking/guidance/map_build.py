@@ -26,7 +26,7 @@ from docking.guidance.map_methods import (
     reprojection_rms_px,
     single_aruco,
 )
-from docking.guidance.marker_survey import Sightings
+from docking.guidance.marker_survey import Sightings, refuse_bent
 from docking.guidance.posed_map import build_from_poses, poses_by_time, thinned
 from docking.guidance.trajectory import read_tum
 from docking.guidance.types import ArMap, Camera, MapQuality, MarkerLayout
@@ -125,6 +125,8 @@ def _timed(request: BuildRequest, path: Path) -> Iterator[tuple[Picture, Pose]]:
 
 def place(scanned: Scanned, layout: MarkerLayout, method: Method, settings: MethodSettings) -> ArMap:
     """The free map put into the cell by one method."""
+    if method != "single-aruco":
+        refuse_bent(scanned.free, layout, scanned.sightings, settings.registration)
     begun = time.perf_counter()
     placed = _PLACE[method](scanned.free, layout, scanned.sightings, settings)
     took = time.perf_counter() - begun
@@ -173,7 +175,8 @@ def _doubts(placed: Placed, layout: MarkerLayout, method: str, rms_mm: float) ->
     if span < _LEAST_SPAN * size:
         doubts.append(f"the markers span {span:.0f} mm of a scan of {size:.0f} mm: far from them the frame is a guess")
     if not (rms_mm <= _DOUBTFUL_RMS_MM):
-        doubts.append(f"the circles lie {rms_mm:.1f} mm rms from their survey in the finished map")
+        how = "cannot be triangulated" if isnan(rms_mm) else f"lie {rms_mm:.1f} mm rms from their survey"
+        doubts.append(f"the circles {how} in the finished map: do not trust it")
     return tuple(doubts)
 
 

@@ -40,6 +40,8 @@ class BuilderSettings:
     features: int = 1500
     overlap_least: float = 0.9
     overlap_wanted: float = 0.96
+    held_share: float = 0.75
+    seen_share: float = 0.15
     longest_s: float = 0.4
     longest_stride: int = 12
     least_points: int = 60
@@ -63,6 +65,7 @@ class MapBuilder:
         self.skipped = 0
         self._told = key_frame or (lambda picture: None)
         self._stride = 1
+        self._found = 0
 
     def build(self, scan: Iterable[Picture]) -> ArMap:
         """The map in a free frame. Raises MapNotBuilt when no start is found or the scan is lost soon."""
@@ -82,7 +85,7 @@ class MapBuilder:
     def _start(self, pictures: Iterator[Picture]) -> Iterator[Picture]:
         """Make the first two key-frames; returns the pictures that come after them.
 
-        A pair with one explanation is taken at once; rivals wait for a picture that decides between them.
+        A pair and its explanations wait for a picture that agrees with one of them: a wrong start bends the whole map.
         """
         first: _Taken | None = None
         waiting: list[tuple[_Taken, list[TwoViews], int]] = []
@@ -100,9 +103,6 @@ class MapBuilder:
             since.append(picture)
             rivals = start(self.camera, first[1], taken[1])
             rivals = [two for two in rivals if two.parallax_deg >= self.settings.start_parallax_deg]
-            if len(rivals) == 1:
-                self._first_map(first, taken, rivals[0])
-                return pictures
             if rivals:
                 waiting.append((taken, rivals, len(since)))
         raise MapNotBuilt("scan", "no images with parallax and common features that leave one explanation")
@@ -150,13 +150,18 @@ class MapBuilder:
             features = self._features(picture)
             tracked = self._track(picture, features)
             overlap = self._overlap(tracked[0]) if tracked else 0.0
-            if tracked and (overlap >= self.settings.overlap_least or ahead == 1):
+            close = overlap >= self.settings.overlap_least and self._holds(tracked)
+            if tracked and (close or ahead == 1):
                 self._insert(picture, features, *tracked)
                 longer = overlap > self.settings.overlap_wanted
                 self._stride = min(max(1, ahead + (1 if longer else 0)), self.settings.longest_stride)
                 return ahead
             ahead //= 2
         return None
+
+    def _holds(self, tracked: tuple[Pose, Rows, Rows] | None) -> bool:
+        """Whether nearly as many points are found again as in the last key-frame: blur asks for shorter steps."""
+        return tracked is not None and len(tracked[1]) >= self.settings.held_share * self._found
 
     def _overlap(self, X_WC: Pose) -> float:
         """Share of the last key-frame's points that lie in the image of another pose."""
@@ -179,7 +184,8 @@ class MapBuilder:
             fit = refine(self.camera, fit.X_WC, sights(whole, features, rows, points))
         except NotLocalised:
             return None
-        if np.count_nonzero(fit.inside) < self.settings.least_points:
+        least = max(self.settings.least_points, self.settings.seen_share * len(wanted.points))
+        if np.count_nonzero(fit.inside) < least:
             return None
         return fit.X_WC, rows[fit.inside], points[fit.inside]
 
@@ -231,6 +237,7 @@ class MapBuilder:
     def _insert(self, picture: Picture, features: Features, X_WC: Pose, rows: Rows, points: Rows) -> None:
         frame = self.map.add_frame(picture.name, picture.t_s, X_WC, features)
         frame.landmarks[rows] = points
+        self._found = len(rows)
         for other in self.map.frames[-2:-5:-1]:
             self.map.add_between(other, frame)
         newest = len(self.map.frames) - 1

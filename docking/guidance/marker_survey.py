@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from docking.errors import MarkersDisagree, MarkersTooFew
+from docking.errors import MapNotBuilt, MarkersDisagree, MarkersTooFew
 from docking.guidance.detection import Gate, MarkerSighting
 from docking.guidance.similarity import Similarity, closed_form, collinear, consistent, refined
 from docking.guidance.triangulation import dlt, parallax_deg
@@ -116,6 +116,15 @@ def triangulated(
     rows = [row for row in rows if row[0] not in rejected]
     columns = [np.array([row[i] for row in rows]) for i in range(4)]
     return Circles(columns[0], columns[1], columns[2].reshape(-1, 3), columns[3].reshape(-1, 3)), rejected
+
+
+def refuse_bent(ar_map: ArMap, layout: MarkerLayout, sightings: Sightings, settings: RegistrationSettings) -> None:
+    """Raises MapNotBuilt where the views of most markers do not meet: then not they have moved, the map is wrong."""
+    circles, apart = triangulated(ar_map.keyframes, ar_map.camera, layout, sightings, settings)
+    meet = {int(marker) for marker in circles.marker}
+    if len(apart) >= max(2, len(meet)):
+        cause = f"the views of {len(apart)} of {len(apart) + len(meet)} markers do not meet: the map is bent"
+        raise MapNotBuilt("markers", cause)
 
 
 def register(ar_map: ArMap, layout: MarkerLayout, sightings: Sightings, settings: RegistrationSettings) -> Registered:

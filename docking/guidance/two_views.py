@@ -25,12 +25,14 @@ Rows = NDArray[np.intp]
 _RANSAC_PX = 1.5
 _CONFIDENCE = 0.999
 _REPROJECTION_PX = 2.5
-_NEXT_BEST = 0.8
+_NEXT_BEST = 0.5
 """Another pose that explains more than this share of the points makes the start ambiguous."""
 _SAME_POSE = 0.1
 """Distance of two poses, rotation and unit baseline together, below which they are one explanation."""
 _CLEARLY = 0.75
 """The better rival misses so much less."""
+_MOST_MISSED_PX = 3.0
+"""In a third image, at the median: blur included."""
 _LEAST_MATCHES = 50
 _UNIT = 100.0
 """Brings a scene with a baseline of 1 to lengths like mm."""
@@ -62,7 +64,7 @@ def match(a: Features, b: Features, rows_a: Rows, rows_b: Rows) -> tuple[Rows, R
 
 
 def start(camera: Camera, a: Features, b: Features) -> list[TwoViews]:
-    """The relative poses that explain two images, best first: none, one, or rivals that a third view must decide."""
+    """The relative poses that explain two images, best first: none, one, or rivals; a third view must agree."""
     rows_a, rows_b = match(a, b, np.arange(len(a.octaves)), np.arange(len(b.octaves)))
     if len(rows_a) < _LEAST_MATCHES:
         return []
@@ -82,9 +84,10 @@ def start(camera: Camera, a: Features, b: Features) -> list[TwoViews]:
 
 
 def decided(camera: Camera, rivals: list[TwoViews], b: Features, c: Features) -> TwoViews | None:
-    """Of rival explanations the one that a third image agrees with, None while it agrees with several."""
-    misses = [(_miss_px(camera, two, b, c), k) for k, two in enumerate(rivals)]
-    misses.sort()
+    """Of the explanations the one that a third image agrees with, None while it agrees with several or with none."""
+    misses = sorted((_miss_px(camera, two, b, c), k) for k, two in enumerate(rivals))
+    if not (misses[0][0] <= _MOST_MISSED_PX):
+        return None
     if len(misses) > 1 and not (misses[0][0] <= _CLEARLY * misses[1][0]):
         return None
     return rivals[misses[0][1]]
