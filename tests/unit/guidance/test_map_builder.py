@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -19,8 +20,10 @@ from docking.guidance.input_files import read_camera, read_layout
 from docking.guidance.map_build import BuildRequest, Scanned, build_map, place, scan
 from docking.guidance.map_builder import BuilderSettings, MapBuilder
 from docking.guidance.map_methods import MethodSettings
+from docking.guidance.opencv import opencv
 from docking.guidance.trajectory import Trajectory, read_tum, trajectory_error, write_tum
 from docking.guidance.types import ArMap
+from docking.types import Pose
 from tests.support.shared_data import shared_data
 
 SCENE = shared_data("ar_scene")
@@ -106,6 +109,23 @@ def test_poses_of_another_program_are_enough(scanned: tuple[Scanned, float], par
         assert trajectory_error(_trajectory(ar_map), _truth()).ate_rmse_m < 0.0015
     with pytest.raises(BadArgument):
         scan(_request(part, builder="tum"), read_layout(SCENE / "markers.csv"))
+
+
+def test_blur_shortens_the_steps_and_does_not_bend_the_map(part: Path) -> None:
+    cv2 = opencv()
+    blurred = (p._replace(image=cv2.GaussianBlur(p.image, (0, 0), 2.5)) for p in pictures(part))
+    free = MapBuilder(read_camera(SCENE / "camera.toml"), BuilderSettings()).build(blurred)
+    assert trajectory_error(_trajectory(free), _truth(), "sim3").ate_rmse_m < 0.002
+
+
+def test_a_bent_map_is_refused(scanned: tuple[Scanned, float]) -> None:
+    free = scanned[0].free
+    frames = tuple(
+        replace(f, X_WC=Pose(f.X_WC.R, f.X_WC.t_mm * [1.0, 1.0, 1.0 + 0.05 * k])) for k, f in enumerate(free.keyframes)
+    )
+    bent = replace(scanned[0], free=replace(free, keyframes=frames))
+    with pytest.raises(MapNotBuilt, match="bent"):
+        place(bent, read_layout(SCENE / "markers.csv"), "joint", MethodSettings())
 
 
 def _spoilt(part: Path, how: str) -> Iterator[Picture]:
