@@ -74,6 +74,7 @@ def _errors(result: Followed) -> str:
     panel.semilogy(path.t_s[some], np.maximum(worst[some], 1e-3), color=COLOURS[0], linewidth=0.8, label="error")
     panel.semilogy(path.t_s[some], path.sd_mm[some].max(axis=1), color=LIMIT, linewidth=0.8, label="predicted sd")
     _bands(panel, result)
+    panel.yaxis.set_major_formatter("{x:g}")
     panel.set_ylabel("mm")
     panel.set_xlabel("t / s")
     panel.legend(loc="upper right")

@@ -21,7 +21,8 @@ from docking.types import Array, Pose
 
 @dataclass(frozen=True)
 class EncoderSettings:
-    """Noise of the encoders' pose at a point (mm), sd of offset and scale at the start, and their walks a sqrt(s)."""
+    """Noise of a read-back (mm) and the time over which a line is laid through them; sd of offset and scale at the
+    start, and their walks a sqrt(s)."""
 
     noise_mm: float = 0.02
     offset_sd_mm: float = 10.0
@@ -29,7 +30,7 @@ class EncoderSettings:
     offset_walk_mm: float = 0.001
     scale_walk: float = 1e-6
     history_s: float = 2.0
-    stale_s: float = 0.5
+    smooth_s: float = 0.1
 
 
 class EncoderTracker:
@@ -47,6 +48,7 @@ class EncoderTracker:
         self._p[0], self._p[2] = s.offset_sd_mm**2, s.scale_sd**2
         self._times: list[float] = []
         self._poses: list[Pose] = []
+        self._places: list[Array] = []
         self._origin: Array | None = None
         self._frame_s = float("nan")
         self._used_s = float("nan")
@@ -64,20 +66,27 @@ class EncoderTracker:
             return
         self._times.append(t_s)
         self._poses.append(X_WB)
+        self._places.append(X_WB.apply(self.body.points_B_mm))
         if len(self._times) > 512 and self._times[256] < t_s - self._s.history_s:
-            del self._times[:256], self._poses[:256]
+            del self._times[:256], self._poses[:256], self._places[:256]
 
-    def _encoder_points(self, t_s: float) -> tuple[Array, Array] | None:
-        """Points (n, 3) by the read-backs at `t_s`, between two of them on a line, and the rotation (3, 3)."""
-        i = bisect_right(self._times, t_s) - 1
-        if i < 0:
+    def _encoder_points(self, t_s: float) -> tuple[Array, Array, float] | None:
+        """Points (n, 3) by the read-backs at `t_s`, on a line through those of the last `smooth_s`; the rotation (3, 3)
+        and by how much the line lessens the noise."""
+        last = bisect_right(self._times, t_s)
+        if last == 0:
             return None
-        a = self._poses[i]
-        here = a.apply(self.body.points_B_mm)
-        if i + 1 < len(self._poses):
-            b, share = self._poses[i + 1], (t_s - self._times[i]) / (self._times[i + 1] - self._times[i])
-            return here + share * (b.apply(self.body.points_B_mm) - here), (a.R if share < 0.5 else b.R)
-        return here, a.R
+        first = bisect_right(self._times, t_s - self._s.smooth_s, 0, last)
+        first = min(first, last - 1)
+        t = np.array(self._times[first:last])
+        off, n = t - t.mean(), len(t)
+        weights = np.full(n, 1.0 / n)
+        if n > 2:
+            weights += (t_s - t.mean()) / float(off @ off) * off
+        elif n == 2:
+            weights = np.array([0.0, 1.0])
+        points = np.tensordot(weights, np.array(self._places[first:last]), 1)
+        return points, self._poses[last - 1].R, float(np.sqrt(weights @ weights))
 
     def points(self, t_s: float, names: tuple[str, ...], xyz_W_mm: Array, cov_mm2: Array) -> None:
         """One frame; see `Tracker.points`. One before the first read-back or out of order is dropped and counted."""
@@ -123,15 +132,16 @@ class EncoderTracker:
         t = max(self._times[-1], self._frame_s) if t_s is None else t_s
         found = self._encoder_points(t)
         assert found is not None
-        here, R = found
+        here, R, less = found
         d = here - self._origin
         oo, os, ss = self._p
         points = here + self._x[0] + self._x[1] * d
-        var = oo + 2.0 * d * os + d * d * ss + self._s.noise_mm**2 + self._s.offset_walk_mm**2 * (t - self._frame_s)
+        var = oo + 2.0 * d * os + d * d * ss + self._s.offset_walk_mm**2 * (t - self._frame_s)
         cov = var[:, :, None] * np.eye(3)
-        return self._described(t, points, cov, R)
+        return self._described(t, points, cov, R, (less * self._s.noise_mm) ** 2)
 
-    def _described(self, t_s: float, points: Array, cov: Array, R: Array) -> TrackedState:
+    def _described(self, t_s: float, points: Array, cov: Array, R: Array, common_mm2: float) -> TrackedState:
+        """`common_mm2`: variance that all points share, the noise of the read-backs."""
         if len(points) >= FOR_A_POSE:
             pose = body_pose(self.body, points, cov)
             points, cov = points_from_pose(self.body, pose)  # a rigid body: every point has the others' readings too
@@ -140,9 +150,12 @@ class EncoderTracker:
             six = np.full((6, 6), np.nan)
             six[3:, 3:] = cov.mean(axis=0) / len(cov)
             pose = described(X, X.apply(self.body.com_B_mm), six)
+        six = pose.cov.copy()
+        six[3:, 3:] += common_mm2 * np.eye(3)
+        cov = cov + common_mm2 * np.eye(3)
         source = "image" if self._seen.any() else "encoders"
         worst = float(np.sqrt(np.trace(cov, axis1=1, axis2=2).max()))
         return TrackedState(
-            t_s, pose.X_WB, np.full(3, np.nan), pose.cov, pose.com_W_mm, points, cov, self._seen, pose.attitude_rad,
+            t_s, pose.X_WB, np.full(3, np.nan), six, pose.com_W_mm, points, cov, self._seen, pose.attitude_rad,
             pose.attitude_sd_rad, t_s - self._used_s, source, worst,
         )  # fmt: skip

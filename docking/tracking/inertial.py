@@ -19,7 +19,7 @@ from docking.errors import AttitudeUnknown, BadArgument, DockingError, LeverArmW
 from docking.tracking import inertial_core as core
 from docking.tracking.body import body_pose
 from docking.tracking.faults import Alarms, FrameWatch, InertialWatch, WatchSettings, swapped
-from docking.tracking.inertial_body import body_state
+from docking.tracking.inertial_body import body_state, on_time
 from docking.tracking.inertial_core import BA, BG, PHI, P, V
 from docking.tracking.smoothing import Tape
 from docking.tracking.types import MM_PER_M, BodyModel, InertialModel, Start, TrackedState
@@ -110,6 +110,7 @@ class InertialTracker:
         self._frames_watch = FrameWatch(body, self._s.watch, self._alarms)
         self._rest = RestDetector(self._s.zero_velocity, model) if self._s.zero_velocity else None
         self._resting, self._tape, self._steps = False, tape, 0
+        self._loud_s = float("inf")
         self._head: _Head | None = None
         self._times: list[float] = []
         self._events: list[Event] = []
@@ -139,7 +140,9 @@ class InertialTracker:
         if self._rest is not None:
             quiet = self._rest.sample(t_s, force_m_s2, rate_rad_s) if good else False
             self._resting = self._resting if quiet is None else quiet
-            if quiet:
+            if quiet is False or self._loud_s > t_s:
+                self._loud_s = t_s
+            if quiet and self._s.zero_velocity and t_s - self._loud_s >= self._s.zero_velocity.sure_s:
                 self._add(t_s, Still(self._rest.rate_rad_s))
 
     def points(self, t_s: float, names: tuple[str, ...], xyz_W_mm: Array, cov_mm2: Array) -> None:
@@ -434,7 +437,9 @@ class InertialTracker:
         steps = self._tape.smoothed(self._layout)
         seen = np.zeros(len(self.body.names), dtype=bool)
         times = np.array([nav.t_s for nav, _ in steps])
-        return times, lambda k: body_state(self.body, self._layout, *steps[k], seen, steps[k][0].t_s)
+        return times, lambda k: body_state(
+            self.body, self._layout, on_time(steps[k][0], steps[k][0].rate_bias), steps[k][1], seen, steps[k][0].t_s
+        )
 
     # what is asked ---------------------------------------------------------------------------------------------------
     def navigation(self) -> core.Navigation | None:
@@ -453,7 +458,9 @@ class InertialTracker:
             head = self._advanced(head, t_s, head.sample)
         head = self._carried(head)
         self._tape = tape
-        return body_state(self.body, self._layout, head.nav, head.cov, head.seen, head.used_s)
+        rate = head.sample.rate if head.sample else head.nav.rate_bias
+        nav = on_time(head.nav, rate)
+        return body_state(self.body, self._layout, nav, head.cov, head.seen, head.used_s)
 
 
 def _between(a: Sample, b: Sample, share: float) -> Sample:

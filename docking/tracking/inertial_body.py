@@ -7,8 +7,18 @@ import numpy as np
 from docking.tracking.axis_filters import Mask
 from docking.tracking.body import described, points_from_pose
 from docking.tracking.inertial_core import PHI, Layout, Navigation, P
+from docking.tracking.strapdown import turn
 from docking.tracking.types import BodyModel, TrackedState
 from docking.types import Array, Pose
+
+
+def on_time(nav: Navigation, rate_rad_s: Array) -> Navigation:
+    """The navigation where the body is at its time: what the sensor stamps so happened `late_s` before, so place and
+    attitude go on for that long at the velocity and the sensor's rate (3,)."""
+    if nav.late_s == 0.0:
+        return nav
+    x, y, z = (nav.late_s * (rate_rad_s - nav.rate_bias)).tolist()
+    return nav._replace(p_mm=nav.p_mm + nav.late_s * nav.v_mm_s, C_WI=nav.C_WI @ turn(x, y, z))
 
 
 def body_state(body: BodyModel, layout: Layout, nav: Navigation, cov: Array, seen: Mask, used_s: float) -> TrackedState:

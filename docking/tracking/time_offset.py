@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_coeffs
 
+from docking.pose.batch import fit_poses
+from docking.pose.layout import MIN_POINTS
 from docking.tracking.recording import Recording
 from docking.tracking.strapdown import G_W_MM_S2
 from docking.tracking.types import MM_PER_M
@@ -33,7 +35,7 @@ class TimeOffset(NamedTuple):
 
 
 def find_time_offset(recording: Recording, reach_s: float = 0.3) -> TimeOffset:
-    """The lag within +-`reach_s`, from the first point that is seen throughout enough frames."""
+    """The lag within +-`reach_s`. Raises DegenerateTargets where three points or more lie on a line."""
     grid, image, known = _image_force(recording)
     if known.sum() < _LEAST_S * _RATE_HZ:
         return TimeOffset(0.0, float("nan"))
@@ -49,8 +51,7 @@ def find_time_offset(recording: Recording, reach_s: float = 0.3) -> TimeOffset:
 
 def _image_force(recording: Recording) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Even times (k,), length of the specific force (m/s^2) that the image shows, and whether it is known there."""
-    point = int(np.argmax(recording.seen().sum(axis=0)))
-    xyz = recording.points_W_mm[:, point]
+    xyz = _sensor_places(recording)
     good = np.isfinite(xyz).all(axis=1)
     if good.sum() < 4:
         nothing = np.zeros(0)
@@ -66,6 +67,18 @@ def _image_force(recording: Recording) -> tuple[Array, Array, NDArray[np.bool_]]
     bad = np.convolve(gap.astype(float), np.ones(len(bend)), "same") > 0.0
     bad[: len(bend)] = bad[-len(bend) :] = True
     return grid, force, np.asarray(~bad)
+
+
+def _sensor_places(recording: Recording) -> Array:
+    """Where the sensor is (M, 3) by the pose of three points or more, else the point that is seen most."""
+    body, seen = recording.body, recording.seen()
+    if len(body.names) < MIN_POINTS:
+        return recording.points_W_mm[:, int(np.argmax(seen.sum(axis=0)))]
+    whole, result = seen.all(axis=1), np.full((len(seen), 3), np.nan)
+    if whole.any():
+        poses = fit_poses(body.points_B_mm, recording.points_W_mm[whole])
+        result[whole] = poses.R @ body.X_BI.t_mm + poses.t_mm
+    return result
 
 
 def _kernel(derivative: int) -> Array:

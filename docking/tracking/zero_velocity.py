@@ -21,13 +21,16 @@ _ROOM = 4096
 class ZeroVelocity:
     """Settings: window; largest sd of force and rate in it as a multiple of the sensor's noise; sd of the pseudo
     measurement of velocity; that of the rate taken for bias, as a multiple of the noise of its mean, since windows
-    overlap; and the gate, largest squared Mahalanobis distance, that both must pass."""
+    overlap; the gate, largest squared Mahalanobis distance, that both must pass; and how long it has to have been
+    quiet: a body that starts gently is quiet for a moment, too.
+    """
 
     window_s: float = 0.25
     noise_ratio: float = 1.3
     velocity_sd_mm_s: float = 2.0
     rate_excess: float = 3.5
     gate: float = 11.0
+    sure_s: float = 1.0
     every_s: float = 0.02
 
 

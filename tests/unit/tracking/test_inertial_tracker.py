@@ -104,6 +104,18 @@ def test_a_late_sensor_is_found_before_and_in_the_filter() -> None:
     assert find_time_offset(still).late_s == 0.0
 
 
+def test_the_state_is_where_the_body_is_although_the_stamps_are_late() -> None:
+    """The lag found within the filter is no error of the state, for points far from the sensor too."""
+    body = section(MOUNT)
+    recording, truth, _ = record(body, 9.0, "mems", 14, late_s=0.008)
+    assert find_time_offset(recording).late_s == pytest.approx(0.008, abs=0.003)
+    settings = InertialSettings(extras=Extras(time_sd_s=0.01))
+    path = play(recording, InertialTracker(body, GRADES["mems"], None, settings), np.full(len(truth), -1))
+    late = path.t_s > 5.0
+    error = np.linalg.norm(path.points_W_mm[late] - truth[path.frame[late]], axis=2)
+    assert float(np.sqrt(np.mean(error**2))) < 0.8
+
+
 def test_a_lever_arm_is_estimated() -> None:
     real = BodyModel("P", ("P",), np.array([[80.0, -50.0, 30.0]]))
     recording, _, _ = record(POINT, 25.0, "mems", 6, true_body=real)
