@@ -18,7 +18,7 @@ Rows = NDArray[np.intp]
 
 MOST_BITS = 60
 """Hamming distance of 256 bits up to which two features may be the same point."""
-_NEIGHBOURS = 8
+_NEIGHBOURS = 12
 _NEXT_BEST = 0.85
 """The second best neighbour must be this much worse, or lie on another level of the pyramid."""
 _LEVEL_SLACK = 1.6
@@ -44,6 +44,13 @@ class Visible:
     points: Rows
     pixels: Array
     level: Array
+
+    def thinned(self, most: int | None) -> Visible:
+        """At most so many of them, evenly; all with None."""
+        if most is None or len(self.points) <= most:
+            return self
+        some = slice(None, None, -(-len(self.points) // most))
+        return Visible(self.points[some], self.pixels[some], self.level[some])
 
 
 def looks(ar_map: ArMap) -> Looks:

@@ -27,9 +27,13 @@ from docking.types import Array, Pose
 
 Source = Literal["map", "marker"]
 Rows = NDArray[np.intp]
-_MOST_SEARCHES = 5
-_GROWTH = 1.03
+_WIDE, _FEW = 3.0, 1000
+"""How much wider the first search is than the others, and how many points it looks for."""
+_MOST_SEARCHES = 7
+_GROWTH = 1.01
 """A search that finds this many times the points of the one before is followed by another."""
+_MOST_ADDED, _NEAR = 0.5, 0.2
+"""Largest mean generation of the points that a pose may stand on, unless it is within so many depths of the hint."""
 _LIMITS = 1.5
 """A pose that could draw a corner of the picture off by so many times the limit is none."""
 _ENOUGH = 200
@@ -179,7 +183,7 @@ class Localiser:
                 return self._settled(features, hint)
             except NotLocalised:
                 pass  # The camera may have been carried elsewhere: the whole map is searched.
-        return self._anywhere(features)
+        return self._anywhere(features, hint)
 
     def _by_markers(self, image: Image, layout: MarkerLayout) -> Localised:
         fit, sights = locate_by_markers(grey(image), layout, self.camera)
@@ -187,16 +191,24 @@ class Localiser:
         seen, sigma = int(np.count_nonzero(fit.inside)), self.settings.map_sigma_mm
         return Localised(fit.X_WC, fit.cov, "marker", seen, len(sights), fit.rms_px, depth, sigma, 0.0, self.camera)
 
-    def _anywhere(self, features: Features) -> Localised:
+    def _anywhere(self, features: Features, hint: Pose | None) -> Localised:
         first: NotLocalised | None = None
         for row in self.index.bags.alike(features.descriptors, self.settings.candidates):
             try:
-                return self._settled(features, self._from_frame(features, row))
+                return self._on_built(self._settled(features, self._from_frame(features, row)), hint)
             except NotLocalised as error:
                 first = first or error
         raise first or NotLocalised(
             "image", "nothing in the map looks like it", value=0, limit=self.settings.least_matches
         )
+
+    def _on_built(self, found: Localised, hint: Pose | None) -> Localised:
+        """The pose, if it stands on the map as built: what tracking has added leads on from near by, never begins."""
+        near = hint is not None and float(np.linalg.norm(found.X_WC.t_mm - hint.t_mm)) <= _NEAR * found.depth_mm
+        if not (near or found.generation <= _MOST_ADDED):
+            cause = "what is in view was added while tracking, and alone does not prove a place"
+            raise self._refused(cause, found.points, found.points)
+        return found
 
     def _from_frame(self, features: Features, row: int) -> Pose:
         """X_WC by PnP on the matches with one key-frame."""
@@ -227,15 +239,18 @@ class Localiser:
     def _settled(self, features: Features, X_WC: Pose) -> Localised:
         """Guided search and robust pose, wide and then narrow; judged. Raises NotLocalised."""
         found = 0
-        for radius in (2.0 * self.settings.radius_px, *[self.settings.radius_px] * _MOST_SEARCHES):
-            wanted = guided.visible(self.ar_map, self.index.looks, self.camera, X_WC)
+        for radius, most in (
+            (2.0 * self.settings.radius_px, _FEW),
+            *[(self.settings.radius_px, None)] * _MOST_SEARCHES,
+        ):
+            wanted = guided.visible(self.ar_map, self.index.looks, self.camera, X_WC).thinned(most)
             rows, points = guided.search(self.ar_map, wanted, features, radius)
             if len(rows) < self.settings.least_matches:
                 raise self._refused("the map is not seen where it should be", len(rows), self.settings.least_points)
             fit = refine(self.camera, X_WC, guided.sights(self.ar_map, features, rows, points))
             X_WC, before = fit.X_WC, found
-            found = int(np.count_nonzero(fit.inside))
-            if radius == self.settings.radius_px and found <= _GROWTH * before:
+            found = int(np.count_nonzero(fit.inside)) if most is None else 0
+            if before and found <= _GROWTH * before:
                 break
         return self._judged(features, rows, points, fit, len(wanted.points))
 

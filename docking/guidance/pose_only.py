@@ -19,7 +19,8 @@ from docking.types import Array, Pose
 TUKEY = 4.685
 """Tukey's limit for 95 % efficiency, in sigmas."""
 _ROUNDS = 12
-_STILL = 1e-9
+_STILL = 1e-5
+"""A step of so many mm and mrad is the last."""
 _BLOCKS = 4
 """The image is cut into _BLOCKS x _BLOCKS parts whose residuals count as one observation each in the covariance."""
 
