@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from docking.approach import Approach, Station
+from docking.assemble.live import watched_motion
 from docking.assemble.motion_side import local_motion, motion_beside
 from docking.assemble.wires import Wires
 from docking.cell import Cell
@@ -33,8 +35,9 @@ from docking.config.raising import raising_from
 from docking.config.temperatures import part_temperatures, with_temperatures
 from docking.geometry import pose_from_vector
 from docking.kinematics import Positioners
+from docking.live import LiveListeners, ReportingMotion
 from docking.motion.settle import SettleSettings
-from docking.ports import Aside, Journal, Motion, Operator, SerialLink, Tracker, at_once
+from docking.ports import Aside, Journal, Operator, SerialLink, Tracker, at_once
 from docking.pose import Features, FitSettings
 from docking.procedure import Procedure
 from docking.procedure_settings import Measured, ProcedureSettings
@@ -66,12 +69,13 @@ class Company:
 
 
 def build_cell(
-    cell: CellFile, job: JobFile, wires: Wires, company: Company, motion: Motion | None = None
+    cell: CellFile, job: JobFile, wires: Wires, company: Company, motion: ReportingMotion | None = None
 ) -> Cell[Procedure]:
     """The whole controller of one docking; without `motion` the motion side runs on this very loop."""
     positioners = positioners_from(cell, job)
     if motion is None:
         motion = motion_beside(cell, local_motion(cell, job, wires))
+    watched = watched_motion(cell, job, motion, wires.streams) if cell.live is not None else None
     survey = Survey(
         tracker=tracker_of(cell, wires.serial),
         journal=company.journal,
@@ -84,7 +88,10 @@ def build_cell(
     if company.step and cell.inputs is not None:
         settings = replace(settings, enabling=cell.inputs.names("enabling-device"))
     approach = _approach(cell, job)
-    return Cell(Procedure(settings, approach, survey, motion, company.journal, company.operator))
+    procedure = Procedure(settings, approach, survey, watched or motion, company.journal, company.operator)
+    if watched is not None:
+        watched.listeners = LiveListeners(procedure.alarm, partial(company.journal.write, "live"))
+    return Cell(procedure)
 
 
 def tracker_of(cell: CellFile, link: SerialLink) -> Tracker:

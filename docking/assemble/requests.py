@@ -112,7 +112,7 @@ def _refuse_real_devices(path: Path, found: dict[str, Any]) -> None:
     listed = found.get("modbus")
     hosts = [str(at[0]) for at in listed.values() if at] if isinstance(listed, dict) else []
     far = [host for host in hosts if host not in LOOPBACK]
-    ports = [str(found.get(name, "")) for name in ("tracker", "line")]
+    ports = [str(found.get(name, "")) for name in ("tracker", "line", "camera", "inertial")]
     far += [port for port in ports if port and not port.startswith("/dev/pts/")]
     singles = found.get("singles", {})
     paths = [str(path) for path in singles.values()] if isinstance(singles, dict) else [str(singles)]
@@ -165,7 +165,10 @@ def read_wires(path: Path, cell: CellFile) -> dict[str, Any]:
     listed = found.get("modbus", {})
     whole = isinstance(listed, dict) and set(listed) == expected and (queued or _has_buses(cell, found))
     _refuse_real_devices(path, found)
-    if not (whole and isinstance(found.get("tracker"), str)):
+    serial = ["tracker"]
+    if cell.live is not None:
+        serial += ["camera", *(["inertial"] if cell.inertial is not None else [])]
+    if not (whole and all(isinstance(found.get(name), str) for name in serial)):
         cause = "the file lacks addresses of this cell; let `docking sim` write it"
         raise BadArgument("--wires", cause, value=str(path))
     return found

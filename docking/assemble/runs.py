@@ -6,7 +6,7 @@ import asyncio
 import tempfile
 import time
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,11 +26,13 @@ from docking.assemble.requests import (
 from docking.assemble.scenarios import WatchedJournal, as_expected, event_facts, runner_of, scenario_of
 from docking.assemble.simulated import FarEnd, make_far_end, real_wires, truth_of, virtual_wires
 from docking.assemble.spawned import MotionProcess
+from docking.assemble.streams import stream_wires, streams_of, virtual_streams
 from docking.cell import Cell
 from docking.config.load import file_sha256
 from docking.journal import JournalFile, read
+from docking.live import ReportingMotion
 from docking.operators import AutomaticOperator, TerminalOperator
-from docking.ports import Journal, Motion, Operator, SerialLink, at_once
+from docking.ports import Journal, Operator, SerialLink, at_once
 from docking.procedure import Procedure
 from docking.progress import Progress
 from docking.records import alarm_record
@@ -72,6 +74,8 @@ def dry_run_files(
         async def main() -> dict[str, Any]:
             far = make_far_end(files.cell, files.job, truth, request.seed)
             wires = await virtual_wires(files.cell, far)
+            if files.cell.live is not None:
+                wires = replace(wires, streams=virtual_streams(files.cell, files.job, request.cell_path.parent, far))
             operator = AutomaticOperator(say, request.language)
             return await _dock(_Run(files, request, wires, operator, path, far, simulated=True, scenario=scenario))
 
@@ -92,6 +96,7 @@ def run_on_wires(request: RunRequest, choice: WireChoice, say: Say, *, step: boo
             if choice.sim and choice.wires is None:
                 far = make_far_end(files.cell, files.job, truth_of(request.cell_path), request.seed)
                 found = await real_wires(files.cell, far, folder)
+                found |= stream_wires(files.cell, files.job, request.cell_path.parent, far)
             else:
                 found = read_wires(choice.wires, files.cell) if choice.wires else {}
             operator = (TerminalOperator if step else AutomaticOperator)(say, request.language)
@@ -100,7 +105,8 @@ def run_on_wires(request: RunRequest, choice: WireChoice, say: Say, *, step: boo
             if transcript is not None:
                 serial = TranscribedSerial(serial, transcript, "tracker")
                 found = {**found, "transcript": str(transcript.path.resolve())}
-            wires, joined = Wires(serial=serial), _Joined(process, found)
+            streams = streams_of(files.cell, request.cell_path.parent, found) if files.cell.live is not None else None
+            wires, joined = Wires(serial=serial, streams=streams), _Joined(process, found)
             try:
                 return await _dock(_Run(files, request, wires, operator, path, far, choice.sim, joined, step))
             finally:
@@ -185,7 +191,7 @@ def _let_happen(run: _Run, cell: Cell[Procedure], watched: WatchedJournal) -> No
     watched.watch(cell, runner_of(run.scenario, path, run.files.cell, run.far, told, run.files.job))
 
 
-async def _joined_motion(run: _Run, joined: _Joined, journal: Journal) -> Motion:
+async def _joined_motion(run: _Run, joined: _Joined, journal: Journal) -> ReportingMotion:
     """The motion side in its own process; what it says of itself is kept, and told where it matters."""
     files = run.files
     raised = files.job.level or files.job.lift_mm > 0.0

@@ -11,6 +11,7 @@ from docking.assemble.real_time import on_interrupt, run_real
 from docking.assemble.requests import RunRequest, Say, load_files, opened, prepare, writing
 from docking.assemble.scenarios import runner_of, scenario_of
 from docking.assemble.simulated import make_far_end, real_wires, truth_of
+from docking.assemble.streams import stream_wires
 from docking.words import tell
 from sim.scenario import EventModel
 
@@ -28,6 +29,7 @@ def serve(request: RunRequest, wires_file: Path | None, say: Say, trace: Path | 
             far = make_far_end(files.cell, files.job, truth_of(request.cell_path), request.seed)
             transcript = opened(request.transcript)
             found = await real_wires(files.cell, far, Path(folder), transcript)
+            found |= stream_wires(files.cell, files.job, request.cell_path.parent, far)
             if trace is not None:
                 with writing(trace):
                     far.trace(trace)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from docking.config import CellFile, JobFile
 from docking.config.base import PoseVector
 from docking.config.instruments import NdiConfig
 from docking.errors import BadArgument, FileUnreadable
+from docking.live import LiveStreams
 from docking.ports import InertialSensor, PointStream, SerialLink, SpeedLink
 from drivers.links.serial_port import SerialPort
 from drivers.ndi_line import DEFAULT_BAUD
@@ -19,6 +21,8 @@ from sim.tracker.ndi import NdiCamera
 from sim.tracker.plant_scene import PlantScene, mounted_pose
 from sim.tracker.vectornav import VectorNavSensor
 from sim.wires.pacing import DeviceEnd, SpeedEnd
+from sim.wires.pty_serial import PtySerial
+from sim.wires.virtual_serial import VirtualSerial
 
 CAMERA, INERTIAL = "camera", "inertial sensor"
 LEVEL = (0.0, 0.0, 0.0, 180.0, 0.0, 0.0)
@@ -64,6 +68,49 @@ def simulated_inertial(far: FarEnd, wire: DeviceEnd, mount: PoseVector = LEVEL) 
     sensor = VectorNavSensor(partial(mounted_pose, far.plant, mount), wire, far.loop, far.seed)
     far.devices.append(sensor)
     return sensor
+
+
+def virtual_streams(cell: CellFile, job: JobFile, folder: Path, far: FarEnd) -> LiveStreams:
+    """Simulated sensors before and on the part of `far`, on lines inside the process, and their drivers."""
+    line = VirtualSerial(far.loop, DEFAULT_BAUD, CAMERA)
+    simulated_camera(cell, job, folder, far, line.far)
+    streams = LiveStreams(camera_of(cell, folder, line.near))
+    if cell.inertial is not None:
+        line = VirtualSerial(far.loop, cell.inertial.baud, INERTIAL)
+        simulated_inertial(far, line.far, cell.inertial.mount_pose)
+        streams.inertial = inertial_of(cell, line.near)
+    return streams
+
+
+def stream_wires(cell: CellFile, job: JobFile, folder: Path, far: FarEnd) -> dict[str, str]:
+    """The same on pseudo-terminals; where they are, nothing for a cell without `[live]`."""
+    if cell.live is None:
+        return {}
+    found = {}
+    for name, baud in (("camera", DEFAULT_BAUD), ("inertial", cell.inertial.baud if cell.inertial else None)):
+        if baud is None:
+            continue
+        wire = PtySerial(far.loop, baud)
+        wire.open()
+        far.devices.append(wire)
+        found[name] = wire.path
+        if name == "camera":
+            simulated_camera(cell, job, folder, far, wire)
+        elif cell.inertial is not None:
+            simulated_inertial(far, wire, cell.inertial.mount_pose)
+    return found
+
+
+def streams_of(cell: CellFile, folder: Path, found: Mapping[str, object]) -> LiveStreams:
+    """The sensors of the cell file, on their ports or on those of simulated devices."""
+
+    def link(name: str, port: str, baud: int, what: str) -> SerialPort:
+        return SerialPort(str(found.get(name, port)), baud, what)
+
+    streams = LiveStreams(camera_of(cell, folder, link("camera", _camera(cell).port, DEFAULT_BAUD, CAMERA)))
+    if cell.inertial is not None:
+        streams.inertial = inertial_of(cell, link("inertial", cell.inertial.port, cell.inertial.baud, INERTIAL))
+    return streams
 
 
 def _camera(cell: CellFile) -> NdiConfig:

@@ -8,6 +8,7 @@ from typing import Any
 
 from docking.config import CellFile
 from docking.config.cell import ModbusBus
+from docking.live import LiveStreams
 from docking.ports import CanLink, SerialLink
 from docking.transcript import TranscribedCan, TranscribedSerial, Transcript
 from drivers.canopen.channels import ChannelledCan
@@ -40,9 +41,11 @@ class NearBus:
 
 @dataclass(frozen=True)
 class Wires(NearBus):
-    """The near ends of a cell's wires: the positioners' and the instrument's serial line."""
+    """The near ends of a cell's wires: the positioners' and the instrument's serial line; `streams`: the sensors that
+    follow the part in a move, where the cell has `[live]`."""
 
     serial: SerialLink = field(kw_only=True)
+    streams: LiveStreams | None = field(default=None, kw_only=True)
 
 
 def near_bus(cell: CellFile, found: dict[str, Any]) -> NearBus:
