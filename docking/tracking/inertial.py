@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,72 +16,18 @@ from numpy.typing import NDArray
 from docking.errors import AttitudeUnknown, BadArgument, DockingError, LeverArmWrong
 from docking.tracking import inertial_core as core
 from docking.tracking.body import body_pose
-from docking.tracking.faults import Alarms, FrameWatch, InertialWatch, WatchSettings, swapped
+from docking.tracking.faults import Alarms, FrameWatch, InertialWatch, swapped
 from docking.tracking.inertial_body import body_state, on_time
 from docking.tracking.inertial_core import BA, BG, PHI, P, V
+from docking.tracking.inertial_events import Event, Frame, Head, InertialSettings, Sample, Still, between, whole
 from docking.tracking.smoothing import Tape
 from docking.tracking.types import MM_PER_M, BodyModel, InertialModel, Start, TrackedState
-from docking.tracking.zero_velocity import RestDetector, ZeroVelocity
+from docking.tracking.zero_velocity import RestDetector
 from docking.types import Array, Pose
 
 Mask = NDArray[np.bool_]
 _TRIM = 1024
 _SQUARE_EVERY = 512
-
-
-@dataclass(frozen=True)
-class InertialSettings:
-    """`gate`: largest squared Mahalanobis distance of a point's innovation (3 dof). `cov_step_s`: the covariance is
-    carried on at least so often. `wait_s`: a frame waits so long for the inertial samples to pass it.
-    `blind_force_m_s2`, `blind_rate_rad_s`: what the body may do unnoticed while the inertial sensor is not believed."""
-
-    extras: core.Extras = field(default_factory=core.Extras)
-    zero_velocity: ZeroVelocity | None = field(default_factory=ZeroVelocity)
-    gate: float = 30.0
-    cov_step_s: float = 0.025
-    wait_s: float = 0.02
-    history_s: float = 1.0
-    blind_force_m_s2: float = 5.0
-    blind_rate_rad_s: float = 1.0
-    lever_limit_mm: float = 10.0
-    watch: WatchSettings = field(default_factory=WatchSettings)
-
-
-class Frame(NamedTuple):
-    """Seen points: rows of the body's points, (k, 3) in W, (k, 3, 3)."""
-
-    rows: NDArray[np.intp]
-    xyz_mm: Array
-    cov_mm2: Array
-
-
-class Sample(NamedTuple):
-    """Specific force mm/s^2 and rate rad/s; `good` where it is believed."""
-
-    force: Array
-    rate: Array
-    good: bool
-
-
-class Still(NamedTuple):
-    """The body is at rest, and the mean rate that the sensor then shows."""
-
-    rate: Array
-
-
-Event = Frame | Sample | Still
-
-
-class _Head(NamedTuple):
-    """The filter at its time: nominal state, covariance at the last step and what has been summed since."""
-
-    nav: core.Navigation
-    cov: Array
-    since: core.Since
-    C_before: Array
-    sample: Sample | None
-    seen: Mask
-    used_s: float
 
 
 class InertialTracker:
@@ -111,15 +55,14 @@ class InertialTracker:
         self._rest = RestDetector(self._s.zero_velocity, model) if self._s.zero_velocity else None
         self._resting, self._tape, self._steps = False, tape, 0
         self._loud_s = float("inf")
-        self._head: _Head | None = None
+        self._head: Head | None = None
         self._times: list[float] = []
         self._events: list[Event] = []
-        self._marks: list[_Head] = []
+        self._marks: list[Head] = []
         self._waiting: list[tuple[float, Frame]] = []
         self._newest: tuple[float, Sample] | None = None
         self.dropped = 0
 
-    # what arrives ----------------------------------------------------------------------------------------------------
     def imu(self, t_s: float, force_m_s2: Array, rate_rad_s: Array) -> None:
         """One sample; see `Tracker.imu`."""
         good = self._samples_watch.good(t_s, force_m_s2, rate_rad_s)
@@ -132,7 +75,7 @@ class InertialTracker:
             at, frame = self._waiting.pop(0)
             if before is not None and self._head is not None and before[0] < at < t_s:
                 share = (at - before[0]) / (t_s - before[0])
-                self._add(at, _between(before[1], sample, share))
+                self._add(at, between(before[1], sample, share))
             self._add(at, frame)
         if self._head is None:
             return
@@ -170,7 +113,6 @@ class InertialTracker:
         """See `Tracker.alarms`."""
         return self._alarms.taken()
 
-    # the beginning ---------------------------------------------------------------------------------------------------
     def _begin(self, t_s: float, frame: Frame) -> None:
         """The first frame gives position and, with three points and no stated start, attitude."""
         if len(frame.rows) == 0:
@@ -198,7 +140,7 @@ class InertialTracker:
         cov[PHI, PHI] = turn_cov
         seen = np.zeros(len(self.body.names), dtype=bool)
         self._times, self._events = [], []
-        self._head = _Head(nav, cov, core.NOTHING, C, None, seen, t_s)
+        self._head = Head(nav, cov, core.NOTHING, C, None, seen, t_s)
         self._marks = [self._head]
         if self._tape is not None:
             self._tape.begin(nav, cov)
@@ -210,7 +152,7 @@ class InertialTracker:
             return self._start.R_WB @ self.body.X_BI.R, np.diag([tilt, tilt, heading])
         if len(frame.rows) < 3:
             raise AttitudeUnknown(self.body.name, f"the first frame has {len(frame.rows)} points")
-        pose = body_pose(self.body, *_whole(self.body, frame), rows=frame.rows)
+        pose = body_pose(self.body, *whole(self.body, frame), rows=frame.rows)
         return pose.X_WB.R @ self.body.X_BI.R, 4.0 * pose.cov[:3, :3]
 
     # events ----------------------------------------------------------------------------------------------------------
@@ -249,9 +191,9 @@ class InertialTracker:
         a, b = self._events[before], self._events[after]
         assert isinstance(a, Sample)
         assert isinstance(b, Sample)
-        return _between(a, b, (t_s - self._times[before]) / (self._times[after] - self._times[before]))
+        return between(a, b, (t_s - self._times[before]) / (self._times[after] - self._times[before]))
 
-    def _go_back(self, mark: _Head) -> None:
+    def _go_back(self, mark: Head) -> None:
         self._head = mark
         if self._tape is not None:
             self._tape.back_to(mark.nav.t_s)
@@ -282,7 +224,7 @@ class InertialTracker:
         assert self._head is not None
         self._marks[-1] = self._head
 
-    def _advanced(self, head: _Head, t_s: float, sample: Sample | None) -> _Head:
+    def _advanced(self, head: Head, t_s: float, sample: Sample | None) -> Head:
         """The head at `t_s`: trapezoid between its last sample and `sample`, nothing believed of a bad one."""
         last = head.sample or sample
         dt = t_s - head.nav.t_s
@@ -292,28 +234,19 @@ class InertialTracker:
             return self._blind(head, t_s, sample)
         force, rate = 0.5 * (last.force + sample.force), 0.5 * (last.rate + sample.rate)
         nav, since = core.integrate(head.nav, head.since, t_s, force, rate)
-        return _Head(nav, head.cov, since, head.C_before, sample, head.seen, head.used_s)
+        return Head(nav, head.cov, since, head.C_before, sample, head.seen, head.used_s)
 
-    def _blind(self, head: _Head, t_s: float, sample: Sample | None) -> _Head:
+    def _blind(self, head: Head, t_s: float, sample: Sample | None) -> Head:
         """No sample is believed: the body goes on as it did, and may do what it wants."""
         head = self._carried(head)
         dt = t_s - head.nav.t_s
         nav = head.nav._replace(t_s=t_s, p_mm=head.nav.p_mm + head.nav.v_mm_s * dt)
-        phi = np.eye(self._layout.size)
-        phi[P, V] = dt * np.eye(3)
-        cov = phi @ head.cov @ phi.T
-        a, w = (self._s.blind_force_m_s2 * MM_PER_M) ** 2 * 0.1 * dt, self._s.blind_rate_rad_s**2 * 0.1 * dt
-        i = np.arange(3)
-        cov[i, i] += a * dt * dt / 3.0
-        cov[i, i + 3] += a * dt / 2.0
-        cov[i + 3, i] += a * dt / 2.0
-        cov[i + 3, i + 3] += a
-        cov[i + 6, i + 6] += w
+        phi, cov = core.unguided(head.cov, dt, self._s.blind_force_m_s2 * MM_PER_M, self._s.blind_rate_rad_s)
         if self._tape is not None:
             self._tape.step(nav, phi, cov)
         return head._replace(nav=nav, cov=cov, sample=sample)
 
-    def _carried(self, head: _Head) -> _Head:
+    def _carried(self, head: Head) -> Head:
         """The covariance brought up to the nominal state."""
         if head.since.dt_s == 0.0:
             return head
@@ -358,7 +291,7 @@ class InertialTracker:
         self._take(dx, cov, seen)
         self._check_lever()
 
-    def _passed(self, head: _Head, frame: Frame, rows: Array, residual: Array) -> Mask:
+    def _passed(self, head: Head, frame: Frame, rows: Array, residual: Array) -> Mask:
         """Which points agree with the prediction, each by its own innovation; swapped ones are told apart."""
         h = rows.reshape(-1, 3, self._layout.size)
         s = h @ head.cov @ h.transpose(0, 2, 1) + frame.cov_mm2
@@ -379,7 +312,7 @@ class InertialTracker:
         if self._frames_watch.refused(head.nav.t_s, residual, np.zeros(len(frame.rows), dtype=bool), sd):
             self._restart(head, residual.mean(axis=0))
 
-    def _restart(self, head: _Head, shift_mm: Array) -> None:
+    def _restart(self, head: Head, shift_mm: Array) -> None:
         """Begin anew where the points are seen: nothing else is believed of position and velocity."""
         cov = head.cov.copy()
         for block, sd in ((P, 100.0 + 2.0 * float(np.linalg.norm(shift_mm))), (V, 500.0), (PHI, 0.2)):
@@ -463,12 +396,4 @@ class InertialTracker:
         return body_state(self.body, self._layout, nav, head.cov, head.seen, head.used_s)
 
 
-def _between(a: Sample, b: Sample, share: float) -> Sample:
-    return Sample(a.force + share * (b.force - a.force), a.rate + share * (b.rate - a.rate), a.good and b.good)
-
-
-def _whole(body: BodyModel, frame: Frame) -> tuple[Array, Array]:
-    """A frame's points in the rows of the body; the others are not meant to be used."""
-    points, cov = np.zeros((len(body.names), 3)), np.tile(np.eye(3), (len(body.names), 1, 1))
-    points[frame.rows], cov[frame.rows] = frame.xyz_mm, frame.cov_mm2
-    return points, cov
+__all__ = ["InertialSettings", "InertialTracker"]

@@ -173,6 +173,21 @@ class Propagation:
         cov[i + 12, i + 12] += self._rate_walk * dt
 
 
+def unguided(cov: Array, dt: float, force_sd_mm_s2: float, rate_sd: float) -> tuple[Array, Array]:
+    """(Phi, covariance) after `dt` in which no sample is believed: the body goes on at its velocity, and accelerates
+    and turns at random with these sds and a tenth of a second of memory."""
+    phi = np.eye(len(cov))
+    phi[P, V] = dt * _EYE3
+    after = phi @ cov @ phi.T
+    a, i = force_sd_mm_s2**2 * 0.1 * dt, np.arange(3)
+    after[i, i] += a * dt * dt / 3.0
+    after[i, i + 3] += a * dt / 2.0
+    after[i + 3, i] += a * dt / 2.0
+    after[i + 3, i + 3] += a
+    after[i + 6, i + 6] += rate_sd**2 * 0.1 * dt
+    return phi, after
+
+
 def point_rows(nav: Navigation, layout: Layout, arms_W_mm: Array, turning_W: Array) -> Array:
     """H (3k, n) of points at the arms `C l` (k, 3) from the sensor: z = p + C l. A sensor whose stamps are late by dt
     was, when the image was taken, further on by the velocity of the point times dt."""
