@@ -31,6 +31,8 @@ LEAST_FRAMES = 3
 STALE_S = 0.5
 """Read-backs older than this bridge nothing."""
 RESTING_MM = 1e-3
+SAME_FRAMES = 3
+"""Frames that repeat each other to the last digit while the axes move: before they pass for a deviation."""
 BAD_POINT_SIGMAS = 6.0
 WHERE = "live pose"
 
@@ -61,7 +63,7 @@ class LivePose:
         self._planned: PlannedPoses | None = None
         self._X_WT = settings.X_WT
         self._alarms, self._told = Alarms(), set[type[DockingError]]()
-        self._frames = FrameWatch(self._body, WatchSettings(), self._alarms)
+        self._frames = FrameWatch(self._body, WatchSettings(same_frames=SAME_FRAMES), self._alarms)
         self._over = 0
         self._used_s = float("nan")
         self._q_before: Array | None = None
@@ -87,12 +89,11 @@ class LivePose:
                 self._take_waiting()
 
     def sample(self, sample: InertialSample) -> None:
-        """What the inertial sensor feels."""
-        if self.tracker is None:
-            self._samples.append(sample)
-        else:
+        """What the inertial sensor feels; it waits as frames do, so that everything is told in the order of time."""
+        self._samples.append(sample)
+        if self.tracker is not None:
             with self._guarded():
-                self.tracker.imu(sample.t_s, sample.force_m_s2, sample.rate_rad_s)
+                self._take_waiting()
 
     @contextmanager
     def _guarded(self) -> Iterator[None]:
@@ -117,9 +118,6 @@ class LivePose:
         first_s = self._waiting[0].t_s - self._s.delay_s
         self.tracker.encoders(min(first_s, self._read_backs.newest_s) - 1e-3, X_WC)
         self.tracker.encoders(self._read_backs.newest_s, X_WC)
-        for sample in self._samples:
-            self.tracker.imu(sample.t_s, sample.force_m_s2, sample.rate_rad_s)
-        self._samples.clear()
         self._take_waiting()
 
     def _camera_at(self, X_WC: Pose) -> Pose:
@@ -140,8 +138,18 @@ class LivePose:
 
     # frames ----------------------------------------------------------------------------------------------------------
     def _take_waiting(self) -> None:
-        while self._waiting and self._waiting[0].t_s - self._s.delay_s <= self._read_backs.newest_s:
-            self._take(self._waiting.popleft())
+        until_s = self._read_backs.newest_s
+        while self._waiting and self._waiting[0].t_s - self._s.delay_s <= until_s:
+            frame = self._waiting.popleft()
+            self._feel(frame.t_s - self._s.delay_s)
+            self._take(frame)
+        self._feel(until_s)
+
+    def _feel(self, until_s: float) -> None:
+        assert self.tracker is not None
+        while self._samples and self._samples[0].t_s <= until_s:
+            sample = self._samples.popleft()
+            self.tracker.imu(sample.t_s, sample.force_m_s2, sample.rate_rad_s)
 
     def _take(self, frame: PointFrame) -> None:
         assert self.tracker is not None

@@ -101,9 +101,12 @@ class DryCell:
             self.wires = Wires(serial=self.serial.near, modbus=await self.far.plcs(self.cell, None))
             for station, plc in zip(self.cell.positioners, self.plcs.plcs, strict=True):
                 self._watch_queue(station.name, plc)
-        company = Company(self.journal, self.operator, self.loop.time)
-        self.controller: Cell = build_cell(self.cell, self.job, self.wires, company)
+        self.controller: Cell = self.join()
         self.journal.hooks.append(self._keep_plan)
+
+    def join(self) -> Cell:
+        """The controller on its wires."""
+        return build_cell(self.cell, self.job, self.wires, Company(self.journal, self.operator, self.loop.time))
 
     @property
     def tracker(self) -> Any:
