@@ -97,7 +97,9 @@ def _quiet(panel: Any, points: Array) -> None:
 
     extent = np.ptp(points, axis=0)
     shares = np.maximum(extent / float(np.max(extent)), 0.05)
-    panel.set_box_aspect(shares, zoom=1.15)
+    # A long part fills the width; a part as high as it is long has to leave room for its corners and scales.
+    tallness = float(shares[2] / np.linalg.norm(shares))
+    panel.set_box_aspect(shares, zoom=1.15 - 0.6 * tallness)
     panel.set_proj_type("ortho")
     for letter, axis, share in zip("XYZ", (panel.xaxis, panel.yaxis, panel.zaxis), shares, strict=True):
         axis.set_pane_color((0.5, 0.5, 0.5, 0.06))
