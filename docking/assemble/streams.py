@@ -21,7 +21,7 @@ from sim.tracker.ndi import NdiCamera
 from sim.tracker.plant_scene import PlantScene, mounted_pose
 from sim.tracker.vectornav import VectorNavSensor
 from sim.wires.pacing import DeviceEnd, SpeedEnd
-from sim.wires.pty_serial import PtySerial
+from sim.wires.pty_serial import PtySerial, SteadyPty
 from sim.wires.virtual_serial import VirtualSerial
 
 CAMERA, INERTIAL = "camera", "inertial sensor"
@@ -86,18 +86,17 @@ def stream_wires(cell: CellFile, job: JobFile, folder: Path, far: FarEnd) -> dic
     """The same on pseudo-terminals; where they are, nothing for a cell without `[live]`."""
     if cell.live is None:
         return {}
-    found = {}
-    for name, baud in (("camera", DEFAULT_BAUD), ("inertial", cell.inertial.baud if cell.inertial else None)):
-        if baud is None:
-            continue
-        wire = PtySerial(far.loop, baud)
+    wire: PtySerial = SteadyPty(far.loop, _camera(cell).baud)
+    wire.open()
+    simulated_camera(cell, job, folder, far, wire)
+    far.devices.append(wire)
+    found = {"camera": wire.path}
+    if cell.inertial is not None:
+        wire = PtySerial(far.loop, cell.inertial.baud)
         wire.open()
+        simulated_inertial(far, wire, cell.inertial.mount_pose)
         far.devices.append(wire)
-        found[name] = wire.path
-        if name == "camera":
-            simulated_camera(cell, job, folder, far, wire)
-        elif cell.inertial is not None:
-            simulated_inertial(far, wire, cell.inertial.mount_pose)
+        found["inertial"] = wire.path
     return found
 
 

@@ -99,3 +99,11 @@ class PtySerial:
             sent = 0
         # A UART has no memory for a client that does not read: what does not fit is lost.
         self.lost_bytes += len(data) - sent
+
+
+class SteadyPty(PtySerial):
+    """A pty that stays at its speed: the host's change of speed does not reach the device on a pty, so a device that
+    waits for it would stay at its first one."""
+
+    def set_baud(self, baud: int) -> None:
+        """Nothing changes."""
