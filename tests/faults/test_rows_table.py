@@ -10,9 +10,8 @@ import pytest
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 TABLE = (HERE / "README.md").read_text("utf-8")
-WHOLE = [
-    f"{kind}-{n:02d}" for kind, last in (("TRK", 11), ("CAN", 16), ("MB", 8), ("IO", 2)) for n in range(1, last + 1)
-]
+LAST = {"TRK": 11, "CAN": 16, "MB": 8, "AX": 10, "PLN": 6, "IO": 2}
+WHOLE = [f"{kind}-{n:02d}" for kind, last in LAST.items() for n in range(1, last + 1)]
 ROWS = dict(re.findall(r"^\| ([A-Z]+-\d\d) \|[^|]*\| (.*) \|$", TABLE, re.MULTILINE))
 
 
