@@ -24,14 +24,16 @@ MARGIN_S = 2.0
 def move_single(request: LookRequest, name: str, target_mm: float, speed_mm_s: float | None = None) -> dict[str, Any]:
     """Move one single axis to `target_mm` and wait until it says that it is there.
 
-    Raises BadArgument for an axis or a target that is not in the cell, ConfigError, and as `NumericalDrive.move`.
+    Raises BadArgument for an axis, a target or a speed that is not in the cell, ConfigError, and as `NumericalDrive.move`.
     """
     cell = load_looked_at(request)
     axis = _axis(cell, name)
     speed = axis.v_mm_s if speed_mm_s is None else speed_mm_s
-    for what, value, low, high in (("target", target_mm, *axis.stroke_mm), ("speed", speed, 0.0, axis.v_mm_s)):
-        if not (low <= value <= high):
-            raise BadArgument(f"{name}, {what}", f"{low:g} to {high:g}", value=value)
+    low, high = axis.stroke_mm
+    if not (low <= target_mm <= high):
+        raise BadArgument(f"{name}, target", f"{low:g} to {high:g}", value=target_mm)
+    if not (0.0 < speed <= axis.v_mm_s):
+        raise BadArgument(f"{name}, speed", f"above 0 to {axis.v_mm_s:g}", value=speed)
 
     async def main() -> dict[str, Any]:
         async with wires_of(request, cell) as ends, _drive(axis, ends) as drive:

@@ -62,6 +62,7 @@ def test_one_is_moved_and_says_that_it_is_there(cell, capsys):
     [
         (("platform", "301"), "-20 to 300"),
         (("gate", "10", "--speed", "101"), "0 to 100"),
+        (("gate", "10", "--speed", "0"), "above 0 to 100"),
         (("gate", "nan"), "0 to 900"),
         (("A", "10"), "platform, gate"),
     ],
