@@ -16,7 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from docking.errors import BadRecording, FileUnreadable
 from docking.point_file import read_points
+from docking.stereo_files import PixelRow, read_stereo_camera, stereo_frames
 from docking.tracking.recording import Recording
+from docking.tracking.stereo import StereoCamera
 from docking.tracking.types import BodyModel
 from docking.types import Array
 
@@ -25,6 +27,7 @@ ATTITUDE = ("t_s", "qw", "qx", "qy", "qz")
 ENCODERS = ("t_s", "x_mm", "y_mm", "z_mm", "alpha_deg", "beta_deg", "gamma_deg")
 POINTS = ("t_s", "name", "x_mm", "y_mm", "z_mm")
 SIGMAS = ("sx_mm", "sy_mm", "sz_mm")
+TRACKS = ("t_s", "camera", "name", "u_px", "v_px")
 NOMINAL = ("name", "x_mm", "y_mm", "z_mm")
 BROAD_FRAME_HZ = 50.0
 """Poses of BROAD stand at every inertial sample; so many a second are given to the filters, as a camera would."""
@@ -42,6 +45,9 @@ class _Parts:
     frames: tuple[Array, tuple[str, ...], Array, Array] | None = None
     body: BodyModel | None = None
     moving: Array | None = None
+    cameras: list[StereoCamera] = field(default_factory=list)
+    tracks: tuple[Path, list[PixelRow]] | None = None
+    cov: Array | None = None
     seen: list[str] = field(default_factory=list)
 
 
@@ -53,6 +59,8 @@ def read_recording(paths: Sequence[Path], sigma_mm: float = 1.0) -> Recording:
     parts = _Parts()
     for path in paths:
         _read(path, parts, sigma_mm)
+    if parts.tracks is not None or parts.cameras:
+        _triangulate(paths[0], parts)
     return _assembled(paths[0], parts)
 
 
@@ -72,11 +80,20 @@ def _read(path: Path, parts: _Parts, sigma_mm: float) -> None:
     if path.suffix.lower() == ".mat":
         _read_broad(path, parts, sigma_mm)
         return
+    if path.suffix.lower() == ".toml":
+        parts.cameras.append(read_stereo_camera(path))
+        return
     first = head.decode("utf-8-sig", errors="replace").splitlines()[0] if head.strip() else ""
     columns = tuple(c.strip().lower() for c in first.split(","))
     if columns and columns[0].startswith("#timestamp"):
         _read_euroc(path, columns, parts, sigma_mm)
-    elif columns == IMU:
+    else:
+        _read_columns(path, columns, parts, sigma_mm)
+
+
+def _read_columns(path: Path, columns: tuple[str, ...], parts: _Parts, sigma_mm: float) -> None:
+    """A CSV file of this program, told by its header."""
+    if columns == IMU:
         _once(path, "inertial samples", parts)
         parts.imu = _in_order(path, _table(path, len(IMU)))
     elif columns == ATTITUDE:
@@ -88,12 +105,15 @@ def _read(path: Path, parts: _Parts, sigma_mm: float) -> None:
     elif columns in (POINTS, POINTS + SIGMAS):
         _once(path, "frames", parts)
         parts.frames = _point_rows(path, sigma_mm)
+    elif columns == TRACKS:
+        _once(path, "frames", parts)
+        parts.tracks = path, _pixel_rows(path)
     elif columns[:4] == NOMINAL:
         _once(path, "nominal points", parts)
         points = read_points(path, "nominal")
         parts.body = BodyModel(path.stem, points.names, points.xyz_mm, points.xyz_mm.mean(axis=0))
     else:
-        _bad(path, first, "the header is none of those that are known")
+        _bad(path, ",".join(columns), "the header is none of those that are known")
 
 
 def _once(path: Path, what: str, parts: _Parts) -> None:
@@ -177,6 +197,33 @@ def _point_rows(path: Path, sigma_mm: float) -> tuple[Array, tuple[str, ...], Ar
     return times, names, points, sigma
 
 
+def _pixel_rows(path: Path) -> list[PixelRow]:
+    """Rows of both cameras; one with an empty or `nan` pixel is not seen."""
+    rows = []
+    for number, line in enumerate(_lines(path)[1:], 2):
+        fields = [f.strip() for f in line.split(",")]
+        if not any(fields):
+            continue
+        if len(fields) != len(TRACKS) or not fields[1] or not fields[2]:
+            _bad(path, f"line {number}", "time, camera, name and two pixel coordinates are needed")
+        hidden = any(f.lower() in ("", "nan") for f in fields[3:])
+        u, v = (float("nan"),) * 2 if hidden else (_number(path, number, f) for f in fields[3:])
+        rows.append(PixelRow(_number(path, number, fields[0]), fields[1], fields[2], u, v))
+    if not rows:
+        _bad(path, "0 rows", "the file holds no data")
+    return rows
+
+
+def _triangulate(path: Path, parts: _Parts) -> None:
+    """Points of the pixel tracks, with their covariances."""
+    if parts.tracks is None:
+        _bad(path, ", ".join(camera.name for camera in parts.cameras), "cameras without pixel tracks")
+    found = stereo_frames(parts.tracks[0], parts.cameras, parts.tracks[1])
+    parts.cov = found.cov_mm2
+    sigma = np.sqrt(np.diagonal(found.cov_mm2, axis1=2, axis2=3))
+    parts.frames = found.t_s, found.names, found.xyz_W_mm, np.where(np.isfinite(sigma), sigma, 1.0)
+
+
 def _read_broad(path: Path, parts: _Parts, sigma_mm: float) -> None:
     from scipy.io import loadmat
 
@@ -230,6 +277,10 @@ def _assembled(path: Path, parts: _Parts) -> Recording:
     if parts.body is None and len(names) > 1:
         _bad(path, len(names), "several points need a file of nominal points, header name,x_mm,y_mm,z_mm")
     points, sigma = _in_body_order(path, body, names, points, sigma)
+    cov = None
+    if parts.cov is not None:
+        cov = np.zeros((len(t), len(body.names), 3, 3))
+        cov[:, [body.names.index(name) for name in names]] = parts.cov
     imu = parts.imu if parts.imu is not None else np.zeros((0, 7))
     encoders = parts.encoders if parts.encoders is not None else np.zeros((0, 7))
     zero = float(t[0])
@@ -237,7 +288,7 @@ def _assembled(path: Path, parts: _Parts) -> Recording:
     moving = parts.moving if parts.moving is not None else np.full(len(t), np.nan)
     return Recording(
         path.stem, body, imu[:, 0] - zero, imu[:, 1:4], imu[:, 4:7], t - zero, points, sigma,
-        _attitudes(path, parts.attitude, t), encoders[:, 0] - zero, turns, encoders[:, 1:4], moving,
+        _attitudes(path, parts.attitude, t), encoders[:, 0] - zero, turns, encoders[:, 1:4], moving, cov,
     )  # fmt: skip
 
 

@@ -98,7 +98,7 @@ def play(
         t = float(recording.frame_t_s[m])
         samples.until(t)
         rows = np.flatnonzero(seen[m])
-        cov = recording.sigma_mm[m, rows][:, :, None] ** 2 * np.eye(3)
+        cov = recording.cov_of(m)[rows]
         tracker.points(t, tuple(names[i] for i in rows), recording.points_W_mm[m, rows], cov)
         samples.past(t)
         state = tracker.state(t)
