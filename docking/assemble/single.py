@@ -24,7 +24,7 @@ MARGIN_S = 2.0
 def move_single(request: LookRequest, name: str, target_mm: float, speed_mm_s: float | None = None) -> dict[str, Any]:
     """Move one single axis to `target_mm` and wait until it says that it is there.
 
-    Raises BadArgument for an axis, a target or a speed that is not in the cell, ConfigError, and as `NumericalDrive.move`.
+    Raises BadArgument for an axis, target or speed that is not in the cell, ConfigError, and as `NumericalDrive.move`.
     """
     cell = load_looked_at(request)
     axis = _axis(cell, name)
