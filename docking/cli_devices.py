@@ -14,6 +14,7 @@ from docking.terminal import FILE, json_option, print_json, print_text, transcri
 WIRES = "Addresses that `docking sim` wrote; without it --sim starts its own devices."
 SILENCE = "The drives will miss their controller on purpose. Everything stands, braked, and nothing hangs on a servo?"
 CLEAR = "\x1b[H\x1b[J"
+SHORTEST_S = 0.1
 
 
 @click.command()
@@ -68,7 +69,7 @@ def devices(
 @click.argument("cell", type=FILE)
 @click.option("--sim", is_flag=True, help="Look at simulated devices on real wires.")
 @click.option("--wires", type=FILE, help=WIRES)
-@click.option("--seconds", type=click.FloatRange(min=0.1), help="End after so long (default: with Ctrl-C).")
+@click.option("--seconds", type=click.FloatRange(min=SHORTEST_S), help="End after so long (default: with Ctrl-C).")
 @transcript_option
 @json_option
 def monitor(
@@ -85,6 +86,9 @@ def monitor(
     from docking.assemble.monitoring import monitor as watch
     from docking.assemble.monitoring import monitor_text
 
+    # The range of click lets NaN pass.
+    if seconds is not None and not (seconds >= SHORTEST_S):
+        raise BadArgument("--seconds", f"{SHORTEST_S:g} or more", value=seconds)
     screen = CLEAR if sys.stdout.isatty() else ""
 
     def show(values: dict[str, Any]) -> None:

@@ -76,6 +76,12 @@ def test_a_cell_without_its_devices_is_told_by_name_with_exit_1(capsys, tmp_path
 
 
 @pytest.mark.full
+@pytest.mark.parametrize("seconds", ["nan", "0"])
+def test_a_time_that_is_none_is_refused(seconds, capsys):
+    assert call(["monitor", str(CELLS / "lab-can.toml"), "--sim", "--seconds", seconds]) == 2
+    assert "4004" in capsys.readouterr().err
+
+
 def test_a_wired_permissive_is_waited_for_and_never_asked(tmp_path):
     cell: Path = quick_cell(tmp_path, "lab-can")
     scenario = tmp_path / "busy.toml"
