@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
 from docking.errors import EXIT_FAULT, EXIT_OK, BadArgument
 from docking.terminal import FILE, json_option, print_json, print_text
 
+CLEAR = "\x1b[H\x1b[J"
 METHODS = ("published", "repaired", "ins", "ins-smoothed", "encoders", "auto")
 GRADES = ("tactical", "mems", "adis16448", "consumer")
 
@@ -30,9 +33,16 @@ GRADES = ("tactical", "mems", "adis16448", "consumer")
     "--creeping", is_flag=True, help="The body may move evenly and slowly: a quiet sensor is no sign of rest."
 )
 @click.option("--plot", type=FILE, help="Draw path, error and predicted error into this HTML file.")
+@click.option("--live", is_flag=True, help="FILES is one CELL file: show the pose of its part by its devices.")
+@click.option("--seconds", type=click.FloatRange(min=0.1), help="With --live: end after so long (default: Ctrl-C).")
+@click.option("--sim", is_flag=True, help="With --live: look at simulated devices on real wires.")
+@click.option("--wires", type=FILE, help="With --live --sim: addresses that `docking sim` wrote.")
 @json_option
-def track(files: tuple[Path, ...], plot: Path | None, as_json: bool, **options: object) -> int:
+def track(files: tuple[Path, ...], plot: Path | None, live: bool, as_json: bool, **options: object) -> int:
     """Follow a body through a recording, with points hidden on purpose, and say how far off it was.
+
+    With --live: show where the part of a CELL with [live] is, how well that is known, and what is wrong with a source.
+    Reads only. With --json the last values are printed at the end.
 
     FILES are CSV with the headers of docs/tracking.md (inertial samples, points, attitude, encoders, nominal points),
     a BROAD .mat, or EuRoC CSV files.
@@ -41,7 +51,11 @@ def track(files: tuple[Path, ...], plot: Path | None, as_json: bool, **options: 
     Example: docking track trial.mat --occlude-every 10:3 --method ins
       docking track imu.csv points.csv attitude.csv --occlude 12:3 --plot track.html
       docking track imu0/data.csv state_groundtruth_estimate0/data.csv --grade adis16448 --occlude-every 10:3 --json
+      docking track sim/cells/lab-can-tracked.toml --live --sim --seconds 5
     """
+    if live:
+        return _live(files, options, as_json)
+    _refuse_without_live(options)
     from docking.track_report import run_track, track_text
 
     if plot is not None:
@@ -58,6 +72,36 @@ def track(files: tuple[Path, ...], plot: Path | None, as_json: bool, **options: 
     else:
         print_text(track_text(result))
     return EXIT_OK
+
+
+def _live(files: tuple[Path, ...], options: dict[str, object], as_json: bool) -> int:
+    from docking.assemble.live_look import live_text, look_live
+    from docking.assemble.looking import LookRequest
+    from docking.assemble.requests import WireChoice
+
+    if len(files) != 1:
+        raise BadArgument("--live", "one CELL file is needed", value=len(files), limit=1)
+    wires, sim, seconds = options["wires"], bool(options["sim"]), options["seconds"]
+    if wires is not None and not sim:
+        raise BadArgument("--wires", "addresses of simulated devices need --sim", value=str(wires))
+    screen = CLEAR if sys.stdout.isatty() else ""
+
+    def show(values: dict[str, Any]) -> None:
+        if not as_json:
+            print_text(screen + live_text(values))
+
+    request = LookRequest(files[0], WireChoice(sim, wires if isinstance(wires, Path) else None))
+    values = look_live(request, seconds if isinstance(seconds, float) else None, show)
+    if as_json:
+        print_json(values)
+    return EXIT_OK
+
+
+def _refuse_without_live(options: dict[str, object]) -> None:
+    """Options of --live would be taken and have no effect."""
+    for name in ("seconds", "sim", "wires"):
+        if options.pop(name):
+            raise BadArgument(f"--{name}", "belongs to --live")
 
 
 @click.command("tracking")

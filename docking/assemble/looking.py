@@ -10,6 +10,7 @@ from pathlib import Path
 
 from docking.assemble.requests import WireChoice, opened, read_wires
 from docking.assemble.simulated import make_far_end, real_wires, truth_of
+from docking.assemble.streams import stream_wires
 from docking.assemble.wires import NearBus, near_bus
 from docking.config import CellFile
 from docking.config.load import default_job_path, load_cell, load_job
@@ -38,6 +39,8 @@ class Ends:
     transcript: Transcript | None
     singles: Mapping[str, str] = field(default_factory=dict)
     """Where simulated single axes are, by the line in the cell file."""
+    found: Mapping[str, object] = field(default_factory=dict)
+    """Where simulated devices are, as `docking sim` writes it; empty for real ones."""
 
     @property
     def tap(self) -> Callable[[str, bool, bytes], None] | None:
@@ -61,6 +64,7 @@ async def wires_of(request: LookRequest, cell: CellFile) -> AsyncIterator[Ends]:
             far = make_far_end(cell, job, truth_of(request.cell_path), request.seed)
             stack.push_async_callback(far.close)
             found = await real_wires(cell, far, folder)
+            found |= stream_wires(cell, job, request.cell_path.parent, far)
         transcript = opened(request.transcript)
         port = str(found.get("tracker", cell.tracker.port))
         serial: SerialLink = SerialPort(port, cell.tracker.baud)
@@ -69,7 +73,7 @@ async def wires_of(request: LookRequest, cell: CellFile) -> AsyncIterator[Ends]:
             serial = TranscribedSerial(serial, transcript, "tracker")
         singles = found.get("singles")
         lines = singles if isinstance(singles, dict) else {}
-        yield Ends(port, serial, near_bus(cell, found).transcribed(transcript), transcript, lines)
+        yield Ends(port, serial, near_bus(cell, found).transcribed(transcript), transcript, lines, found)
 
 
 def load_looked_at(request: LookRequest) -> CellFile:

@@ -39,10 +39,11 @@ WHERE = "live pose"
 
 @dataclass
 class LiveFigures:
-    """Largest of a move: deviation from the plan (mm), predicted sd (mm), time without a seen point (s); frames used
-    and of those left out."""
+    """Largest of a move: deviation from the plan (mm; `last_mm` of the newest frame), predicted sd (mm), time without a
+    seen point (s); frames used and of those left out."""
 
     deviation_mm: float = 0.0
+    last_mm: float = 0.0
     predicted_sd_mm: float = 0.0
     blind_s: float = 0.0
     frames: int = 0
@@ -71,15 +72,14 @@ class LivePose:
     # what arrives ----------------------------------------------------------------------------------------------------
     def read_back(self, feedback: Feedback) -> None:
         """Where the axes stand."""
-        with self._guarded():
-            self._read_back(feedback)
+        self.axes(feedback.t_s, feedback.position_mm)
 
-    def _read_back(self, feedback: Feedback) -> None:
-        if not self._read_backs.add(feedback.t_s, feedback.position_mm):
-            return
-        if self.tracker is not None:
-            self.tracker.encoders(feedback.t_s, pose_from_axes(self._s.positioners, feedback.position_mm))
-            self._take_waiting()
+    def axes(self, t_s: float, q_mm: Array) -> None:
+        """Axis positions (m,) at `t_s`."""
+        with self._guarded():
+            if self._read_backs.add(t_s, q_mm) and self.tracker is not None:
+                self.tracker.encoders(t_s, pose_from_axes(self._s.positioners, q_mm))
+                self._take_waiting()
 
     def frame(self, frame: PointFrame) -> None:
         """What the camera sees; it waits until the read-backs have passed it."""
@@ -203,6 +203,7 @@ class LivePose:
             names = tuple(self._body.names[i] for i in seen.rows)
         sizes = np.linalg.norm(apart, axis=1)
         worst = int(np.argmax(sizes))
+        self.figures.last_mm = float(sizes[worst])
         self._over = 0 if sizes[worst] <= self._s.deviation_mm else self._over + 1
         if self._over < self._s.frames:
             # A single frame may err; what stands in so many in a row is what the part did.
