@@ -103,8 +103,7 @@ class DriveProof:
         return await self._sdo.read(self._map.objects[name])
 
     async def _text(self, name: str) -> str:
-        data = await self._sdo.read_bytes(self._map.objects[name])
-        return data.rstrip(b"\x00").decode("ascii", "replace")
+        return await self._sdo.read_text(self._map.objects[name])
 
     def _expect(self, name: str, value: int, wanted: int) -> None:
         if value != wanted:

@@ -110,8 +110,7 @@ class CanIoModule:
         ):
             if count < least:
                 raise WrongIdentity(self.where, f"node {node}", value=f"{count} {what}", limit=f"{least} {what}")
-        texts = [await self._sdo.read_bytes(objects[name]) for name in ("device_name", "software_version")]
-        name, version = (text.rstrip(b"\0").decode("ascii", "replace") for text in texts)
+        name, version = [await self._sdo.read_text(objects[name]) for name in ("device_name", "software_version")]
         product = f"{name} {found['product']:08X}h".strip()
         firmware = f"{version} revision {found['revision']:08X}h".strip()
         return Identity(self.where, f"{found['vendor']:08X}h", product, str(found["serial"]), firmware)

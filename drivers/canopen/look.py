@@ -166,10 +166,9 @@ class BusLook:
         objects = self._map.objects
         try:
             numbers = [await sdo.read(objects[name]) for name in ("vendor", "product", "revision", "serial")]
-            texts = [await sdo.read_bytes(objects[name]) for name in ("device_name", "software_version")]
+            name, version = [await sdo.read_text(objects[name]) for name in ("device_name", "software_version")]
         except DockingError:
             return None
-        name, version = (text.rstrip(b"\0").decode("ascii", "replace") for text in texts)
         vendor, product, revision, serial = numbers
         firmware = f"{version} revision {revision:08X}h".strip()
         return Identity(where, f"{vendor:08X}h", f"{name} {product:08X}h".strip(), str(serial), firmware)

@@ -62,6 +62,17 @@ class SdoClient:
         except struct.error as error:
             raise BadReply(self.where, f"{entry.label}: length does not match its type", value=data.hex()) from error
 
+    async def read_text(self, entry: ObjectEntry) -> str:
+        """What the device says of itself; "" where it refuses: CiA 301 leaves names and versions to the maker.
+
+        Raises DeviceSilent, BadReply.
+        """
+        try:
+            data = await self.read_bytes(entry)
+        except DeviceRefused:
+            return ""
+        return data.rstrip(b"\0").decode("ascii", "replace")
+
     async def read_bytes(self, entry: ObjectEntry) -> bytes:
         """Read an object as bytes, segmented where the device wants it so."""
         async with self._busy:

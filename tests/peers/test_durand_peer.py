@@ -11,10 +11,9 @@ import can
 import numpy as np
 import pytest
 
-from docking.types import AxisState, Feedback
-from drivers.canopen.positioners import CanopenPositioners
+from docking.types import AxisState
 from drivers.links.can_bus import CanBusLink
-from tests.support.can_bench import can_cell, exchange, foreign_drives
+from tests.support.can_bench import follow, lags
 
 durand = pytest.importorskip("durand")
 pytestmark = [pytest.mark.peer, pytest.mark.wires]
@@ -110,24 +109,6 @@ class PeerDrive:
             self.od.write(0x6064, 0, counts)
 
 
-async def follow(link: CanBusLink, cycles: int) -> tuple[list[Feedback], list[np.ndarray], list[str]]:
-    loop = asyncio.get_running_loop()
-    master = CanopenPositioners(foreign_drives(can_cell("lab-can")), link)
-    identities = await master.bring_up()
-    q = (await master.enable()).position_mm
-    path = [q + 0.02 * k * np.linspace(-1.0, 1.0, len(q)) for k in range(cycles)]
-    feedback = []
-    start = loop.time()
-    for k, target in enumerate(path):
-        feedback.append(exchange(master, target))
-        await asyncio.sleep(start + (k + 1) * master.cycle_s - loop.time())
-    feedback.append(exchange(master, path[-1]))
-    await asyncio.sleep(master.cycle_s)
-    feedback.append(exchange(master, path[-1]))
-    await master.close()
-    return feedback, path, [f"{i.product} {i.serial}" for i in identities]
-
-
 async def test_durand_slaves_are_brought_up_enabled_and_follow() -> None:
     from durand.scheduler import AsyncScheduler, set_scheduler
 
@@ -142,9 +123,7 @@ async def test_durand_slaves_are_brought_up_enabled_and_follow() -> None:
         np.testing.assert_allclose(path[0], 0.1 * np.arange(1, 13), atol=1e-9)
         np.testing.assert_allclose(feedback[-1].position_mm, path[-1], atol=0.51e-4)
         assert feedback[-1].fault is None
-        moving = [f.position_mm for f in feedback]
-        lag = [min(range(len(path)), key=lambda k: float(np.abs(path[k] - p).max())) for p in moving[10:60]]
-        assert all(1 <= k - found <= 5 for k, found in enumerate(lag, start=10)), "never ahead of what was sent"
+        assert all(1 <= behind <= 5 for behind in lags(feedback, path)), "never ahead of what was sent"
         assert all(drive.stage == 0x40 for drive in drives)
         od = drives[3].od
         assert od.read(0x1016, 1) == 127 << 16 | 280

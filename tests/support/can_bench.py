@@ -12,6 +12,7 @@ from docking.config.cell import CellFile, DriveIdentity
 from docking.config.load import load_cell
 from docking.types import Array, Feedback
 from drivers.canopen.positioners import CanopenPositioners
+from drivers.links.can_bus import CanBusLink
 from sim.canopen import DriveGroup, DriveSettings
 from sim.wires.virtual_can import VirtualCan
 
@@ -81,6 +82,32 @@ def exchange(master: CanopenPositioners, setpoint_mm: Array) -> Feedback:
     feedback = master.latest()
     master.send(setpoint_mm)
     return feedback
+
+
+async def follow(link: CanBusLink, cycles: int) -> tuple[list[Feedback], list[Array], list[str]]:
+    """Bring foreign drives up, enable them and lead them along a straight line: read-backs, set-points, identities."""
+    loop = asyncio.get_running_loop()
+    master = CanopenPositioners(foreign_drives(can_cell("lab-can")), link)
+    identities = await master.bring_up()
+    q = (await master.enable()).position_mm
+    path = [q + 0.02 * k * np.linspace(-1.0, 1.0, len(q)) for k in range(cycles)]
+    feedback = []
+    start = loop.time()
+    for k, target in enumerate(path):
+        feedback.append(exchange(master, target))
+        await asyncio.sleep(start + (k + 1) * master.cycle_s - loop.time())
+    feedback.append(exchange(master, path[-1]))
+    await asyncio.sleep(master.cycle_s)
+    feedback.append(exchange(master, path[-1]))
+    await master.close()
+    return feedback, path, [f"{i.product} {i.serial}" for i in identities]
+
+
+def lags(feedback: list[Feedback], path: list[Array]) -> list[int]:
+    """By how many cycles each read-back is behind the set-point of its own cycle, from the tenth cycle on."""
+    moving = [f.position_mm for f in feedback[: len(path)]]
+    nearest = [min(range(len(path)), key=lambda k: float(np.abs(path[k] - p).max())) for p in moving]
+    return [k - found for k, found in enumerate(nearest)][10:]
 
 
 class Bench:

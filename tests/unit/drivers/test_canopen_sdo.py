@@ -53,6 +53,15 @@ def test_segmented_read() -> None:
     run_virtual(main)
 
 
+def test_a_text_that_the_device_does_not_have_is_empty() -> None:
+    async def main() -> None:
+        wire = Wire()
+        assert await wire.client.read_text(MAP.objects["device_name"]) == "Simulated positioner drive"
+        assert await wire.client.read_text(ObjectEntry("nothing", 0x5555, 0, "text")) == ""
+
+    run_virtual(main)
+
+
 def test_segmented_write_is_refused_with_words() -> None:
     async def main() -> None:
         wire = Wire()
