@@ -32,6 +32,9 @@ GRADES = ("tactical", "mems", "adis16448", "consumer")
 @click.option(
     "--creeping", is_flag=True, help="The body may move evenly and slowly: a quiet sensor is no sign of rest."
 )
+@click.option(
+    "--joint", metavar="FIRST:SECOND:AX,AY,AZ", multiple=True, help="A hinge between two bodies (repeatable)."
+)
 @click.option("--plot", type=FILE, help="Draw path, error and predicted error into this HTML file.")
 @click.option("--live", is_flag=True, help="FILES is one CELL file: show the pose of its part by its devices.")
 @click.option("--seconds", type=click.FloatRange(min=0.1), help="With --live: end after so long (default: Ctrl-C).")
@@ -45,23 +48,27 @@ def track(files: tuple[Path, ...], plot: Path | None, live: bool, as_json: bool,
     Reads only. With --json the last values are printed at the end.
 
     FILES are CSV with the headers of docs/tracking.md (inertial samples, points, attitude, encoders, nominal points),
-    a BROAD .mat, or EuRoC CSV files.
+    a BROAD .mat, or EuRoC CSV files. Several files of nominal points are several bodies, joined by --joint.
 
     \b
     Example: docking track trial.mat --occlude-every 10:3 --method ins
       docking track imu.csv points.csv attitude.csv --occlude 12:3 --plot track.html
       docking track imu0/data.csv state_groundtruth_estimate0/data.csv --grade adis16448 --occlude-every 10:3 --json
+      docking track base.csv arm.csv points.csv base.imu.csv --joint base:arm:0,1,0 --json
       docking track sim/cells/lab-can-tracked.toml --live --sim --seconds 5
     """
     if live:
         return _live(files, options, as_json)
     _refuse_without_live(options)
+    from docking.recordings import nominal_files
     from docking.track_report import run_track, track_text
 
     if plot is not None:
         from docking.report.sheet import check_drawing
 
         check_drawing()
+    if options["joint"] or len(nominal_files(files)) > 1:
+        return _bodies(files, options, plot, as_json)
     result = run_track(files, options)
     if plot is not None:
         from docking.report.track_page import write_track_page
@@ -71,6 +78,21 @@ def track(files: tuple[Path, ...], plot: Path | None, live: bool, as_json: bool,
         print_json(result.as_json())
     else:
         print_text(track_text(result))
+    return EXIT_OK
+
+
+def _bodies(files: tuple[Path, ...], options: dict[str, object], plot: Path | None, as_json: bool) -> int:
+    from docking.track_bodies import bodies_text, run_bodies
+
+    result = run_bodies(files, options)
+    if plot is not None:
+        from docking.report.track_page import write_bodies_page
+
+        write_bodies_page(result, plot)
+    if as_json:
+        print_json(result.as_json())
+    else:
+        print_text(bodies_text(result))
     return EXIT_OK
 
 

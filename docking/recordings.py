@@ -48,6 +48,8 @@ class _Parts:
     cameras: list[StereoCamera] = field(default_factory=list)
     tracks: tuple[Path, list[PixelRow]] | None = None
     cov: Array | None = None
+    others: frozenset[str] = frozenset()
+    """names that points may have although this body has none of them"""
     seen: list[str] = field(default_factory=list)
 
 
@@ -64,6 +66,49 @@ def read_recording(paths: Sequence[Path], sigma_mm: float = 1.0) -> Recording:
     return _assembled(paths[0], parts)
 
 
+def nominal_files(paths: Sequence[Path]) -> list[Path]:
+    """Those that hold nominal points: one a body. Raises FileUnreadable."""
+    return [path for path in paths if path.suffix.lower() == ".csv" and _columns(path)[:4] == NOMINAL]
+
+
+def read_bodies(paths: Sequence[Path], sigma_mm: float = 1.0) -> list[Recording]:
+    """One recording a file of nominal points. A file called BODY.anything.csv belongs to that body alone; frames, pixel
+    tracks and cameras belong to all, everything else to the first body.
+
+    Raises as `read_recording`, and BadRecording for points that no body has.
+    """
+    nominal = nominal_files(paths)
+    bodies = [path.stem for path in nominal]
+    names = [name for path in nominal for name in read_points(path, "nominal").names]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        _bad(nominal[0], twice[0], "a point that two bodies have")
+    found = []
+    for k, own in enumerate(nominal):
+        parts = _Parts(others=frozenset(names))
+        for path in paths:
+            owner = path.name.split(".")[0] if path.name.count(".") > 1 else ""
+            shared = path.suffix.lower() == ".toml" or _columns(path) in (POINTS, POINTS + SIGMAS, TRACKS)
+            mine = owner == own.stem if owner in bodies else (shared or k == 0)
+            if path == own or (path not in nominal and mine):
+                _read(path, parts, sigma_mm)
+        if parts.tracks is not None or parts.cameras:
+            _triangulate(own, parts)
+        found.append(_assembled(own, parts))
+    return found
+
+
+def _columns(path: Path) -> tuple[str, ...]:
+    """The names in the header line of a CSV file, in small letters."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(4096)
+    except OSError as error:
+        raise FileUnreadable(str(path), error.strerror or type(error).__name__) from error
+    first = head.decode("utf-8-sig", errors="replace").splitlines()[0] if head.strip() else ""
+    return tuple(c.strip().lower() for c in first.split(","))
+
+
 def _bad(path: Path, value: object, cause: str) -> NoReturn:
     raise BadRecording(str(path), cause, value=str(value)[:80])
 
@@ -71,8 +116,6 @@ def _bad(path: Path, value: object, cause: str) -> NoReturn:
 def _read(path: Path, parts: _Parts, sigma_mm: float) -> None:
     try:
         size = path.stat().st_size
-        with path.open("rb") as file:
-            head = file.read(4096)
     except OSError as error:
         raise FileUnreadable(str(path), error.strerror or type(error).__name__) from error
     if size > _MOST_BYTES:
@@ -83,8 +126,7 @@ def _read(path: Path, parts: _Parts, sigma_mm: float) -> None:
     if path.suffix.lower() == ".toml":
         parts.cameras.append(read_stereo_camera(path))
         return
-    first = head.decode("utf-8-sig", errors="replace").splitlines()[0] if head.strip() else ""
-    columns = tuple(c.strip().lower() for c in first.split(","))
+    columns = _columns(path)
     if columns and columns[0].startswith("#timestamp"):
         _read_euroc(path, columns, parts, sigma_mm)
     else:
@@ -276,11 +318,13 @@ def _assembled(path: Path, parts: _Parts) -> Recording:
     body = parts.body or BodyModel("body", names, np.zeros((len(names), 3)))
     if parts.body is None and len(names) > 1:
         _bad(path, len(names), "several points need a file of nominal points, header name,x_mm,y_mm,z_mm")
+    here = [k for k, name in enumerate(names) if name in body.names or name not in parts.others]
+    names, points, sigma = tuple(names[k] for k in here), points[:, here], sigma[:, here]
     points, sigma = _in_body_order(path, body, names, points, sigma)
     cov = None
     if parts.cov is not None:
         cov = np.zeros((len(t), len(body.names), 3, 3))
-        cov[:, [body.names.index(name) for name in names]] = parts.cov
+        cov[:, [body.names.index(name) for name in names]] = parts.cov[:, here]
     imu = parts.imu if parts.imu is not None else np.zeros((0, 7))
     encoders = parts.encoders if parts.encoders is not None else np.zeros((0, 7))
     zero = float(t[0])

@@ -16,14 +16,20 @@ from docking.tracking.replay import every
 
 def run_track(files: Sequence[Path], options: Mapping[str, object]) -> Followed:
     """Read, hide, follow. Raises FileUnreadable, BadRecording, BadArgument and what the trackers raise."""
+    settings, sigma = settings_of(options)
+    recording = read_recording(files, sigma)
+    return follow(recording, gaps_of(recording, options), settings)
+
+
+def settings_of(options: Mapping[str, object]) -> tuple[FollowSettings, float]:
+    """How to follow, and the noise of a coordinate where no file states one, mm. Raises BadArgument."""
     sigma = options["sigma_mm"]
     if not (isinstance(sigma, float) and 0.0 < sigma < float("inf")):
         raise BadArgument("--sigma-mm", "a positive length is needed", value=str(sigma))
-    recording = read_recording(files, sigma)
     settings = FollowSettings(
         str(options["method"]), GRADES[str(options["grade"])], rest=not options.get("creeping", False)
     )
-    return follow(recording, gaps_of(recording, options), settings)
+    return settings, sigma
 
 
 def gaps_of(recording: Recording, options: Mapping[str, object]) -> list[Gap]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from docking.report.figures import COLOURS, GREY, LIMIT, panels, style, svg
 from docking.report.sheet import table, write_sheet
+from docking.track_bodies import BodiesTracked, JointTrack, bodies_text
 from docking.track_report import track_text
 from docking.tracking.follow import Followed
 
@@ -35,6 +36,42 @@ def write_track_page(result: Followed, path: Path) -> None:
         _table(result),
     ]
     write_sheet(f"{result.recording.name} followed by {result.method}", body, path)
+
+
+def write_bodies_page(result: BodiesTracked, path: Path) -> None:
+    """Write the page of one `docking track` with several bodies. Raises FileUnwritable."""
+    with style():
+        figures = [("Predicted error of each body, its worst point.", _known(result))]
+        figures += [(f"Hinge {j.first}:{j.second}, one sigma as a band.", _angle(j)) for j in result.joints if j.rows]
+    body = [f"<p>{escape(line)}</p>" for line in bodies_text(result).splitlines()]
+    body += [f"<figure>{drawing}<figcaption>{escape(text)}</figcaption></figure>" for text, drawing in figures]
+    write_sheet(" and ".join(one.name for one in result.bodies), body, path)
+
+
+def _known(result: BodiesTracked) -> str:
+    figure, axes = panels(2.8)
+    _clear(figure, axes)
+    for k, one in enumerate(result.bodies):
+        table = one.as_json()
+        axes[0].plot(
+            table["t_s"], table["predicted_sd_mm"], color=COLOURS[k % len(COLOURS)], linewidth=0.8, label=one.name
+        )
+    axes[0].set_ylabel("predicted sd / mm")
+    axes[0].set_xlabel("t / s")
+    axes[0].legend(loc="upper right")
+    return svg(figure, "known")
+
+
+def _angle(joint: JointTrack) -> str:
+    figure, axes = panels(2.8)
+    _clear(figure, axes)
+    table = joint.as_json()
+    t, angle, sd = (np.array(table[key]) for key in ("t_s", "angle_deg", "angle_sd_deg"))
+    axes[0].fill_between(t, angle - sd, angle + sd, color=GREY, alpha=0.4, linewidth=0)
+    axes[0].plot(t, angle, color=COLOURS[0], linewidth=0.8)
+    axes[0].set_ylabel("angle / deg")
+    axes[0].set_xlabel("t / s")
+    return svg(figure, f"{joint.first}-{joint.second}")
 
 
 def _thin(count: int) -> slice:

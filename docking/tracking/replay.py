@@ -39,12 +39,13 @@ class GapResult:
 @dataclass(frozen=True, eq=False)
 class Path:
     """The estimate at every frame from the first used on: times (m,), frame numbers (m,), points (m, n, 3), predicted
-    3-D sd (m, n) of every point."""
+    3-D sd (m, n) of every point, and the whole states (m)."""
 
     t_s: Array
     frame: NDArray[np.intp]
     points_W_mm: Array
     sd_mm: Array
+    states: tuple[TrackedState, ...] = ()
 
 
 def hidden(recording: Recording, gaps: Sequence[Gap]) -> NDArray[np.intp]:
@@ -115,7 +116,7 @@ def _path(recording: Recording, states: list[TrackedState], frames: list[int]) -
     points = np.array([s.points_W_mm for s in states]).reshape(-1, n, 3)
     sd = np.array([np.sqrt(np.trace(s.point_cov_mm2, axis1=1, axis2=2)) for s in states]).reshape(-1, n)
     at = np.array(frames, dtype=np.intp)
-    return Path(recording.frame_t_s[at], at, points, sd)
+    return Path(recording.frame_t_s[at], at, points, sd, tuple(states))
 
 
 class _Feed:
