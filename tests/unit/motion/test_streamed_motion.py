@@ -241,8 +241,8 @@ def test_a_drive_that_faults_while_a_trip_is_led_to_rest_makes_all_stop_by_thems
 def test_a_coupling_trip_stops_all_axes_on_the_path():
     async def scenario(bench):
         move = await bench.begin()
-        away = -0.02 * (np.arange(12) == 4)
-        for cycle in range(20):
+        away = -0.01 * (np.arange(12) == 4)
+        for cycle in range(40):
             after(0.5 * PLAN.duration_s + 0.01 * cycle, setattr, bench.bus, "offset_mm", (cycle + 1) * away)
         result = await move
         assert result.result == "fault"
