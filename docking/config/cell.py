@@ -321,10 +321,17 @@ class CellFile(Model):
     )
 
     @model_validator(mode="after")
-    def _live_needs_a_camera(self) -> Self:
-        """Nothing but a camera sees what the encoders do not."""
-        if self.live is not None and self.camera is None:
+    def _live_has_its_sensors(self) -> Self:
+        """Nothing but a camera sees what the encoders do not, and an inertial method needs what it integrates."""
+        if self.live is None:
+            return self
+        if self.camera is None:
             raise ValueError("[live] needs a [camera]")
+        if self.live.method not in ("auto", "encoders") and self.inertial is None:
+            raise ValueError(f"live.method = {self.live.method!r} needs an [inertial] sensor")
+        names = [point.name for point in self.live.points]
+        if len(set(names)) != len(names):
+            raise ValueError("live.points: names repeat")
         return self
 
     @property

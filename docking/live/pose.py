@@ -21,7 +21,6 @@ from docking.live.seen import SeenPoints, seen_points
 from docking.live.settings import LiveSettings, tracker_at_rest
 from docking.pose.batch import fit_poses
 from docking.sightings import InertialSample, PointFrame
-from docking.tracking.body import body_pose
 from docking.tracking.faults import Alarms, FrameWatch, WatchSettings, swapped
 from docking.tracking.types import TrackedState, Tracker
 from docking.types import Array, Feedback, Plan, Pose
@@ -167,7 +166,7 @@ class LivePose:
         pairs = swapped(expected_W[seen.rows], seen.xyz_mm, self._s.match_mm)
         named = [(int(seen.rows[i]), int(seen.rows[j])) for i, j in pairs]
         self._frames.tell_swapped(self._body.names, named)
-        seen = self._agreeing(seen.without({i for pair in named for i in pair}))
+        seen, X_seen = self._agreeing(seen.without({i for pair in named for i in pair}))
         cov = np.tile(self._s.sigma_mm**2 * np.eye(3), (len(seen.rows), 1, 1))
         self.tracker.points(t_s, tuple(self._body.names[i] for i in seen.rows), seen.xyz_mm, cov)
         if len(seen.rows) == 0:
@@ -175,27 +174,25 @@ class LivePose:
             return
         self._used_s = t_s
         self.figures.frames += 1
-        self._compare(seen, X_plan)
+        self._compare(seen, X_seen, X_plan)
 
-    def _agreeing(self, seen: SeenPoints) -> SeenPoints:
-        """Without single points that do not lie where the others have the part: another marker, a reflection."""
-        while len(seen.rows) > FOR_A_POSE:
+    def _agreeing(self, seen: SeenPoints) -> tuple[SeenPoints, Pose | None]:
+        """The points that lie where the others have the part, without another marker or a reflection, and the part's
+        pose by them; None for the pose where they are too few."""
+        while len(seen.rows) >= FOR_A_POSE:
             nominal = self._body.points_B_mm[seen.rows]
             fitted = fit_poses(nominal, seen.xyz_mm[None])
-            gaps = np.linalg.norm(seen.xyz_mm - Pose(fitted.R[0], fitted.t_mm[0]).apply(nominal), axis=1)
+            X_seen = Pose(fitted.R[0], fitted.t_mm[0])
+            gaps = np.linalg.norm(seen.xyz_mm - X_seen.apply(nominal), axis=1)
             worst = int(np.argmax(gaps))
-            if gaps[worst] <= BAD_POINT_SIGMAS * self._s.sigma_mm:
-                break
+            if len(gaps) == FOR_A_POSE or gaps[worst] <= BAD_POINT_SIGMAS * self._s.sigma_mm:
+                return seen, X_seen
             seen = seen.without({int(seen.rows[worst])})
-        return seen
+        return seen, None
 
-    def _compare(self, seen: SeenPoints, X_plan: Pose) -> None:
+    def _compare(self, seen: SeenPoints, X_seen: Pose | None, X_plan: Pose) -> None:
         """Deviation of the pose that this frame shows from the plan's, at the features; of too few points, at these."""
-        if len(seen.rows) >= FOR_A_POSE:
-            whole = np.zeros((len(self._body.names), 3))
-            whole[seen.rows] = seen.xyz_mm
-            cov = np.tile(self._s.sigma_mm**2 * np.eye(3), (len(whole), 1, 1))
-            X_seen = body_pose(self._body, whole, cov, rows=seen.rows).X_WB
+        if X_seen is not None:
             apart = X_seen.apply(self._s.features_C_mm) - X_plan.apply(self._s.features_C_mm)
             names = self._s.feature_names
         else:
