@@ -14,13 +14,11 @@ from docking.assemble.wires import near_bus
 from docking.config.load import load_cell
 from drivers.canopen.shared import SharedCan
 from drivers.inputs import WiredInputs
-from drivers.links.can_bus import CanBusLink
 from sim.virtual_time import run_virtual
-from sim.wires.unix_can import UnixCanServer
-from sim.wires.virtual_can import VirtualCan
 from tests.conformance.inputs_checks import CHECKS, Wired
 from tests.fakes.inputs import FakeInputs
-from tests.support.input_bench import CONTACT, KINDS, MODULE, SENSOR, InputBench
+from tests.support.input_bench import CONTACT, MODULE, SENSOR, InputBench
+from tests.support.module_bench import KINDS
 
 Check = Callable[[Wired], Awaitable[None]]
 
@@ -48,11 +46,7 @@ def _subject(bench: InputBench, inputs: WiredInputs) -> Wired:
 def test_the_simulated_module_in_virtual_time(check: Check, kind: str) -> None:
     async def main() -> None:
         bench = InputBench(kind)
-        if kind == "cia401":
-            bus = VirtualCan(bench.loop, 1_000_000)
-            inputs = await bench.on_can(bus.end(), bus.end())
-        else:
-            inputs = await bench.on_tcp(bench.config.modules[0].port)
+        inputs = await bench.in_virtual_time()
         await check(_subject(bench, inputs))
         await inputs.close()
         await bench.close()
@@ -65,12 +59,7 @@ def test_the_simulated_module_in_virtual_time(check: Check, kind: str) -> None:
 @pytest.mark.wires
 async def test_the_simulated_module_over_real_wires(check: Check, kind: str, tmp_path: Path) -> None:
     bench = InputBench(kind)
-    if kind == "cia401":
-        server = UnixCanServer(tmp_path / "can0")
-        bench.closing.append(server.close)
-        inputs = await bench.on_can(server, CanBusLink("docking-unix", str(tmp_path / "can0"), 1_000_000))
-    else:
-        inputs = await bench.on_tcp(0)
+    inputs = await bench.on_real_wires(tmp_path)
     try:
         await check(_subject(bench, inputs))
         await inputs.close()

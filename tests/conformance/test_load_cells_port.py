@@ -13,14 +13,12 @@ from docking.assemble.wires import near_bus
 from docking.config.load import load_cell
 from docking.errors import LoadCellBroken
 from drivers.canopen.shared import SharedCan
-from drivers.links.can_bus import CanBusLink
 from drivers.load_cells import AnalogueLoadCells
 from sim.virtual_time import run_virtual
-from sim.wires.unix_can import UnixCanServer
-from sim.wires.virtual_can import VirtualCan
 from tests.conformance.load_cells_checks import CHECKS, Weighed
 from tests.fakes.load_cells import FakeLoadCells
-from tests.support.force_bench import KINDS, NAME, ForceBench
+from tests.support.force_bench import NAME, ForceBench
+from tests.support.module_bench import KINDS
 
 Check = Callable[[Weighed], Awaitable[None]]
 UNDER_B = (3, 4, 5)
@@ -43,19 +41,12 @@ def _subject(bench: ForceBench, cells: AnalogueLoadCells) -> Weighed:
     return Weighed(cells, NAME, UNDER_B, bench.pull, bench.tear, bench.mute)
 
 
-async def _virtual(bench: ForceBench, kind: str) -> AnalogueLoadCells:
-    if kind == "cia401":
-        bus = VirtualCan(bench.loop, 1_000_000)
-        return await bench.on_can(bus.end(), bus.end())
-    return await bench.on_tcp(15042)
-
-
 @checks
 @kinds
 def test_the_simulated_module_in_virtual_time(check: Check, kind: str) -> None:
     async def main() -> None:
         bench = ForceBench(kind)
-        cells = await _virtual(bench, kind)
+        cells = await bench.in_virtual_time()
         await check(_subject(bench, cells))
         await cells.close()
         await bench.close()
@@ -68,12 +59,7 @@ def test_the_simulated_module_in_virtual_time(check: Check, kind: str) -> None:
 @pytest.mark.wires
 async def test_the_simulated_module_over_real_wires(check: Check, kind: str, tmp_path: Path) -> None:
     bench = ForceBench(kind)
-    if kind == "cia401":
-        server = UnixCanServer(tmp_path / "can0")
-        bench.closing.append(server.close)
-        cells = await bench.on_can(server, CanBusLink("docking-unix", str(tmp_path / "can0"), 1_000_000))
-    else:
-        cells = await bench.on_tcp(0)
+    cells = await bench.on_real_wires(tmp_path)
     try:
         await check(_subject(bench, cells))
         await cells.close()
@@ -106,7 +92,7 @@ def test_what_a_current_means(kind: str, ma: float, force_n: float) -> None:
 
     async def main(counts: tuple[int, int]) -> float:
         bench = ForceBench(kind, counts)
-        cells = await _virtual(bench, kind)
+        cells = await bench.in_virtual_time()
         bench.current(ma)
         await cells.bring_up()
         found = float(cells.latest()[3])
@@ -123,7 +109,7 @@ def test_what_a_current_means(kind: str, ma: float, force_n: float) -> None:
 def test_a_current_outside_means_none(kind: str, ma: float, said: str) -> None:
     async def main() -> None:
         bench = ForceBench(kind)
-        cells = await _virtual(bench, kind)
+        cells = await bench.in_virtual_time()
         bench.current(ma)
         with pytest.raises(LoadCellBroken) as refused:
             await cells.bring_up()

@@ -2,27 +2,15 @@
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from docking.config.inputs import CanModule, ForceInput, InputsConfig, ModbusModule
-from docking.config.load import load_cell
-from docking.ports import CanLink
-from drivers.canopen.io_module import CanIoModule
-from drivers.canopen.shared import SharedCan
 from drivers.inputs import InputModule
 from drivers.load_cells import AnalogueLoadCells
-from drivers.modbus_inputs import ModbusIoModule
-from sim.canopen.io_module import IoModule
-from sim.input_world import InputWorld
-from sim.plc.io_module import IoRegisters, IoServer
+from tests.support.module_bench import ModuleBench
 
-CELL = Path(__file__).parents[2] / "sim" / "cells" / "lab-can.toml"
-KINDS = ("cia401", "modbus-io")
 MODULE, NAME, NODE = "force_B", "cell_B", 42
 _MODULES = {
     "cia401": CanModule(kind="cia401", name=MODULE, node=NODE, refresh_s=0.01),
@@ -43,39 +31,14 @@ class Loaded:
         return dict.fromkeys(("component", "mate", "floor"), 20.0)
 
 
-class ForceBench:
+class ForceBench(ModuleBench[AnalogueLoadCells]):
     """The module of one kind, what pulls at its load cell, and what may be done to it."""
 
     def __init__(self, kind: str, counts: tuple[int, int] = (5530, 27648)) -> None:
-        self.loop = asyncio.get_running_loop()
-        self.plant = Loaded()
         force = ForceInput(name=NAME, positioner="B", module=MODULE, channels=(0, 2, 3), counts=counts)
-        self.inputs = InputsConfig(modules=(_MODULES[kind],), forces=(force,))
-        self.cell = load_cell(CELL).model_copy(update={"inputs": self.inputs})
-        self.world = InputWorld(self.cell, self.plant, self.loop, 1)
-        self.closing: list[Callable[[], Any]] = []
+        super().__init__(InputsConfig(modules=(_MODULES[kind],), forces=(force,)), Loaded())
 
-    async def on_can(self, far: Any, near: CanLink) -> AnalogueLoadCells:
-        """The module at the end `far` of a bus, the driver at `near`."""
-        await far.open()
-        device = IoModule(MODULE, NODE, self.world, far, self.loop)
-        device.start()
-        self.closing.insert(0, device.close)
-        config = self.inputs.modules[0]
-        assert isinstance(config, CanModule)
-        end = SharedCan(near).end(CanIoModule.cobs(config))
-        return self._cells(CanIoModule(config, end, lambda code: f"{code:08X}h"))
-
-    async def on_tcp(self, port: int) -> AnalogueLoadCells:
-        """The module behind a TCP port (0: a free one), and its driver."""
-        config = self.inputs.modules[0]
-        assert isinstance(config, ModbusModule)
-        server = IoServer(IoRegisters(MODULE, self.world, self.loop.time), config.unit)
-        address = await server.serve("127.0.0.1", port)
-        self.closing.append(server.close)
-        return self._cells(ModbusIoModule(config, address))
-
-    def _cells(self, module: InputModule) -> AnalogueLoadCells:
+    def driver(self, module: InputModule) -> AnalogueLoadCells:
         return AnalogueLoadCells(self.cell, {MODULE: module})
 
     def pull(self, x_n: float, y_n: float, z_n: float) -> None:
@@ -88,12 +51,3 @@ class ForceBench:
 
     def tear(self, torn: bool) -> None:
         self.world.break_sensor(NAME, torn)
-
-    def mute(self, muted: bool) -> None:
-        self.world.mute(MODULE, muted)
-
-    async def close(self) -> None:
-        for close in self.closing:
-            result = close()
-            if asyncio.iscoroutine(result):
-                await result
