@@ -33,13 +33,17 @@ def tell(language: str, key: str, **facts: Any) -> str:
             spoken |= {name: fact.text(language), "remedy": fact.remedy(language)}
     for name in ("kind", "limited_by"):
         if name in spoken:
-            spoken[name] = _term(str(spoken[name]), catalogue["terms"])
+            spoken[name] = term(language, str(spoken[name]))
     text: str = catalogue[key]
     return text.format(**spoken)
 
 
-def _term(text: str, terms: dict[str, str]) -> str:
-    """A whole term, or one that begins with the name of an axis."""
+def term(language: str, text: str) -> str:
+    """A word of planning and motion in the language: a whole term, or one that begins with the name of an axis.
+
+    What is no term stays as it is.
+    """
+    terms: dict[str, str] = texts(language)["terms"]
     if text in terms:
         return terms[text]
     axis, _, what = text.partition(" ")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from docking.report import words as wording
 from docking.report.figures import style
 from docking.report.run import Record, Run, summary
 from docking.report.traces import Track, track
+from docking.words import term
 
 OUTCOMES = ("docked", "out_of_tolerance", "stopped", "fault", "refused")
 
@@ -46,6 +48,7 @@ def html(records: list[Record], language: str = "en") -> str:
         "clock": wording.clock,
         "plain": wording.plain,
         "cssstring": wording.css_string,
+        "term": partial(term, language),
     }
     template = resources.files("docking").joinpath("templates", "report.html.j2").read_text("utf-8")
     figures = {name: Markup(text) for name, text in drawings(run, words).items()}
@@ -85,7 +88,7 @@ def view(run: Run, language: str) -> dict[str, Any]:
         "lateness": tables.lateness_rows(run),
         "late_ms": tables.LATE_MS,
         "alarms": alarm_rows(run, language),
-        "events": tables.event_rows(run, words),
+        "events": tables.event_rows(run, words, language),
         "head": run.records[-1] if run.records else None,
         "length": tables.length,
         "nan": float("nan"),

@@ -11,6 +11,7 @@ from docking.motion.lateness import LATENESS
 from docking.report.run import Body, Move, Record, Run
 from docking.report.words import number, plain
 from docking.types import RISK_LIMIT
+from docking.words import term
 
 Row = dict[str, Any]
 
@@ -346,7 +347,7 @@ def _nearest_force(move: Move, limits: dict[str, Any]) -> Row:
     return {"axis_force_n": force, "axis_limit_n": limit, "force_axis": axis}
 
 
-def event_rows(run: Run, words: dict[str, str]) -> list[Row]:
+def event_rows(run: Run, words: dict[str, str], language: str) -> list[Row]:
     """The time line: everything but state changes and single measurements, in one short sentence each."""
     rows = []
     for record in run.records:
@@ -357,6 +358,7 @@ def event_rows(run: Run, words: dict[str, str]) -> list[Row]:
         lists = {key: value for key, value in record["body"].items() if isinstance(value, list)}
         body |= {key: ", ".join(value) or words["none"] for key, value in lists.items() if _are_words(value)}
         body["plan"] = plain(record["body"].get("plan_hash"))[:8]
+        body["result"] = term(language, body.get("result", ""))
         rows.append({"age_s": run.age_s(record), "seq": record["seq"], "text": _filled(template, body, words)})
     return rows
 

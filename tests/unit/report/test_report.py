@@ -290,8 +290,10 @@ def test_chinese_report(docked: list[dict[str, Any]]) -> None:
     text = html(docked, "zh")
     assert '<html lang="zh">' in text
     page = Page(text).text
-    for word in ("对接报告", "对接完成", "公差", "跟随误差", "一致性残差", "急停为硬接线"):
+    for word in ("对接报告", "对接完成", "公差", "跟随误差", "一致性残差", "急停为硬接线", "阶段速度"):
         assert word in page
+    assert "stage speed" not in page
+    assert "done" not in page
     with pytest.raises(BadArgument, match="fr"):
         html(docked, "fr")
 
