@@ -15,6 +15,8 @@ from docking.config.findings import Finding, Severity
 from docking.config.job import JobFile
 from docking.config.load import default_job_path, file_sha256, load_cell, load_job
 from docking.config.torque_off import strain_json
+from docking.errors import BadMesh, ConfigInvalid, FileUnreadable
+from docking.guidance.mesh import read_mesh
 from docking.kinematics import conditioning
 
 __all__ = ["CheckResult", "check_cell", "check_files", "check_job"]
@@ -83,6 +85,20 @@ def check_files(cell_path: Path, job_path: Path | None = None) -> CheckResult:
     cell = load_cell(cell_path)
     job_path = default_job_path(cell_path) if job_path is None else job_path
     job = load_job(job_path, cell)
+    _check_meshes(job, job_path)
     found = [(cell_path, f) for f in check_cell(cell)] + [(job_path, f) for f in check_job(cell, job)]
     warnings = tuple((path, f) for path, f in found if f.severity is Severity.WARNING)
     return CheckResult(cell_path, job_path, cell, job, warnings)
+
+
+def _check_meshes(job: JobFile, job_path: Path) -> None:
+    """Every mesh of the work instructions is there and can be drawn: a missing one would show at the machine only."""
+    problems = []
+    for k, step in enumerate(job.instructions):
+        if step.mesh is not None:
+            try:
+                read_mesh(job_path.parent / step.mesh)
+            except (FileUnreadable, BadMesh) as refused:
+                problems.append(f"instructions[{k}].mesh: {refused.text().splitlines()[0]}")
+    if problems:
+        raise ConfigInvalid(str(job_path), tuple(problems))

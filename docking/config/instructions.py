@@ -23,7 +23,9 @@ class Instruction(Model):
     pose: PoseVector = Field(description="of the part in that frame, mm and deg")
     mesh: Annotated[str, Field(max_length=260)] | None = Field(
         default=None,
-        description="the part: an STL (mm) or glTF file (.stl, .gltf, .glb), beside the job file; none: its axes are drawn",
+        description=(
+            "the part: an STL (mm) or glTF file (.stl, .gltf, .glb), beside the job file; none: its axes are drawn"
+        ),
     )
 
     def text(self, language: str) -> str:

@@ -47,7 +47,7 @@ def read_model(folder: Path) -> ColmapModel:
             cameras = _text_cameras((folder / "cameras.txt").read_text("utf-8"))
             poses = _text_images((folder / "images.txt").read_text("utf-8"))
     except OSError as error:
-        raise FileUnreadable(str(folder), error.strerror or str(error)) from error
+        raise FileUnreadable(str(error.filename or folder), error.strerror or str(error)) from error
     except (ValueError, IndexError, struct.error) as error:
         raise ConfigInvalid(str(folder), (f"not a COLMAP model: {error}",)) from error
     if len(cameras) != 1 or not poses:

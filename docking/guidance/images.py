@@ -28,6 +28,8 @@ def pictures(source: Path, fps: float = FOLDER_FPS, *, colour: bool = False) -> 
 
     Grey (h, w), or with `colour` BGR (h, w, 3). Raises FileUnreadable, ExtraMissing.
     """
+    if not source.exists():
+        raise FileUnreadable(str(source), "no such file or folder")
     if source.is_dir():
         files = sorted(path for path in source.iterdir() if path.suffix.lower() in SUFFIXES)
         if not files:
