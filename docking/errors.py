@@ -48,9 +48,10 @@ class DockingError(Exception):
 
     def text(self, language: str = "en") -> str:
         """The whole message in one language: what, where, value, limit and cause."""
-        return catalogue(language)[str(self.code)]["message"].format(
-            where=self.where, value=_plain(self.value), limit=_plain(self.limit), cause=self.cause
-        )
+        message = catalogue(language)[str(self.code)]["message"]
+        facts = {"where": self.where, "value": _plain(self.value), "limit": _plain(self.limit), "cause": self.cause}
+        # A text ends with its cause, which not every error has.
+        return message.format(**facts).rstrip()
 
     def remedy(self, language: str = "en") -> str:
         """What to do about it."""

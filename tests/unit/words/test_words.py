@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from docking.errors import BadArgument, DriveFault
+from docking.errors import AxisStuck, BadArgument, DriveFault
 from docking.words import LANGUAGES, tell, texts
 
 ROOT = Path(__file__).parents[3]
@@ -56,6 +56,12 @@ def test_an_error_speaks_the_language_and_brings_its_remedy() -> None:
     error = DriveFault("A.X", "over-current", value=0x2310)
     assert tell("zh", "alarm", code=2106, error=error) == f"2106:{error.text('zh')}\n    -> {error.remedy('zh')}"
     assert tell("en", "alarm", code=2106, error=error) == f"2106: {error.text('en')}\n    -> {error.remedy('en')}"
+
+
+def test_an_error_without_a_cause_ends_with_its_last_word() -> None:
+    error = AxisStuck("A.X", "", value=0.021, limit=0.02)
+    assert error.text("en").endswith("0.02 mm.")
+    assert error.text("zh") == error.text("zh").strip()
 
 
 def test_an_unknown_language_is_named() -> None:
