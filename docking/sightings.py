@@ -20,13 +20,15 @@ class Sight(Enum):
 @dataclass(frozen=True, eq=False)
 class ToolSighting:
     """One tool in the camera's frame T: place of its origin `p_T_mm` (3,), turn as unit quaternion (4,) w x y z,
-    residual of its markers `error_mm`; all NaN unless `sight` is SEEN or OUTSIDE."""
+    residual of its markers `error_mm`; all NaN unless `sight` is SEEN or OUTSIDE. `cov_T_mm2` (3, 3) of its place,
+    where the camera can say it."""
 
     name: str
     sight: Sight
     p_T_mm: Array
     turn: Array
     error_mm: float
+    cov_T_mm2: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)

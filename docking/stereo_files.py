@@ -5,32 +5,16 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 
-from docking.config.base import Finite, Model, PoseVector, Positive
+from docking.config.live import CameraCalibration
 from docking.errors import BadRecording, ConfigInvalid, FileUnreadable
 from docking.geometry import pose_from_vector
 from docking.tracking.stereo import StereoCamera, triangulate
 from docking.types import Array
-
-
-class CameraFile(Model):
-    """Calibration of one camera and where it stands."""
-
-    width_px: Positive = Field(description="of the image, px")
-    height_px: Positive = Field(description="of the image, px")
-    fx_px: Positive = Field(description="focal length, px")
-    fy_px: Positive = Field(description="focal length, px")
-    cx_px: Positive = Field(description="principal point, px")
-    cy_px: Positive = Field(description="principal point, px")
-    distortion: Annotated[tuple[Finite, ...], Field(min_length=4, max_length=5)] = Field(
-        default=(0.0,) * 5, description="Brown: k1, k2, p1, p2(, k3)"
-    )
-    pose: PoseVector = Field(description="X_W camera, mm and deg; camera axes: x right, y down, z ahead")
-    pixel_sigma: Positive = Field(default=0.2, description="noise of a pixel coordinate, 1 sigma, px")
 
 
 class PixelRow(NamedTuple):
@@ -62,14 +46,19 @@ def read_stereo_camera(path: Path) -> StereoCamera:
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ConfigInvalid(str(path), (str(error),)) from error
     try:
-        found = CameraFile.model_validate(_tuples(table))
+        found = CameraCalibration.model_validate(_tuples(table))
     except ValidationError as error:
         problems = tuple(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
         raise ConfigInvalid(str(path), problems) from error
+    return stereo_camera(path.stem, found)
+
+
+def stereo_camera(name: str, found: CameraCalibration) -> StereoCamera:
+    """The camera of a calibration."""
     bent = np.zeros(5)
     bent[: len(found.distortion)] = found.distortion
     focal, centre = np.array([found.fx_px, found.fy_px]), np.array([found.cx_px, found.cy_px])
-    return StereoCamera(path.stem, focal, centre, bent, pose_from_vector(found.pose), found.pixel_sigma)
+    return StereoCamera(name, focal, centre, bent, pose_from_vector(found.pose), found.pixel_sigma)
 
 
 def _tuples(table: dict[str, object]) -> dict[str, object]:

@@ -36,7 +36,8 @@ def live_settings(cell: CellFile, job: JobFile, live: LiveConfig) -> LiveSetting
     mount = pose_from_vector(cell.inertial.mount_pose) if cell.inertial is not None else Pose.identity()
     return LiveSettings(
         body=BodyModel("part", names, places, np.array(part.com_mm), mount),
-        tools=frozenset(point.name for point in live.points),
+        # The lines of a camera pair name every point, those of a single camera its tools.
+        tools=frozenset(names if cell.stereo is not None else (point.name for point in live.points)),
         feature_names=features.names,
         features_C_mm=features.xyz_mm,
         positioners=positioners_from(cell, job),

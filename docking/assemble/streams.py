@@ -10,15 +10,19 @@ from docking.assemble.simulated import FarEnd
 from docking.config import CellFile, JobFile
 from docking.config.base import PoseVector
 from docking.config.instruments import NdiConfig
+from docking.config.live import StereoConfig
 from docking.errors import BadArgument, FileUnreadable
 from docking.live import LiveStreams
 from docking.ports import InertialSensor, PointStream, SerialLink, SpeedLink
+from docking.stereo_files import stereo_camera
 from drivers.links.serial_port import SerialPort
 from drivers.ndi_line import DEFAULT_BAUD
 from drivers.ndi_stream import NdiStream
+from drivers.pixel_pair import PixelPair
 from drivers.vectornav import VectorNav
 from sim.tracker.ndi import NdiCamera
-from sim.tracker.plant_scene import PlantScene, mounted_pose
+from sim.tracker.pixel_pair import PixelPairComputer
+from sim.tracker.plant_scene import PlantScene, mounted_pose, points_on_part
 from sim.tracker.vectornav import VectorNavSensor
 from sim.wires.pacing import DeviceEnd, SpeedEnd
 from sim.wires.pty_serial import PtySerial, SteadyPty
@@ -70,11 +74,37 @@ def simulated_inertial(far: FarEnd, wire: DeviceEnd, mount: PoseVector = LEVEL) 
     return sensor
 
 
+def pair_of(config: StereoConfig, link: SerialLink) -> PixelPair:
+    """The camera pair of the cell file on `link`."""
+    first, second = (stereo_camera(one.name, one) for one in config.cameras)
+    return PixelPair(link, (first, second), CAMERA)
+
+
+def simulated_pair(cell: CellFile, job: JobFile, far: FarEnd, wire: DeviceEnd) -> None:
+    """A camera pair before the plant of `far`: the targets of the part, and the points of `[live]` on it."""
+    if cell.stereo is None:
+        raise BadArgument(CAMERA, "the cell has no camera pair")
+    points = {point.name: point.at_mm for point in cell.live.points} if cell.live is not None else {}
+    targets = tuple(target.name for target in job.component.targets)
+    scene = partial(points_on_part, far.plant, points, targets)
+    pair = PixelPairComputer(scene, cell.stereo.cameras, wire, far.loop, cell.stereo.rate_hz, far.seed)
+    far.devices.append(pair)
+
+
+def _first_baud(cell: CellFile) -> int:
+    """At which the line to the camera begins."""
+    return DEFAULT_BAUD if cell.stereo is None else cell.stereo.baud
+
+
 def virtual_streams(cell: CellFile, job: JobFile, folder: Path, far: FarEnd) -> LiveStreams:
     """Simulated sensors before and on the part of `far`, on lines inside the process, and their drivers."""
-    line = VirtualSerial(far.loop, DEFAULT_BAUD, CAMERA)
-    simulated_camera(cell, job, folder, far, line.far)
-    streams = LiveStreams(camera_of(cell, folder, line.near))
+    line = VirtualSerial(far.loop, _first_baud(cell), CAMERA)
+    if cell.stereo is not None:
+        simulated_pair(cell, job, far, line.far)
+        streams = LiveStreams(pair_of(cell.stereo, line.near))
+    else:
+        simulated_camera(cell, job, folder, far, line.far)
+        streams = LiveStreams(camera_of(cell, folder, line.near))
     if cell.inertial is not None:
         line = VirtualSerial(far.loop, cell.inertial.baud, INERTIAL)
         simulated_inertial(far, line.far, cell.inertial.mount_pose)
@@ -86,9 +116,12 @@ def stream_wires(cell: CellFile, job: JobFile, folder: Path, far: FarEnd) -> dic
     """The same on pseudo-terminals; where they are, nothing for a cell without `[live]`."""
     if cell.live is None:
         return {}
-    wire: PtySerial = SteadyPty(far.loop, _camera(cell).baud)
+    wire: PtySerial = SteadyPty(far.loop, (cell.stereo or _camera(cell)).baud)
     wire.open()
-    simulated_camera(cell, job, folder, far, wire)
+    if cell.stereo is not None:
+        simulated_pair(cell, job, far, wire)
+    else:
+        simulated_camera(cell, job, folder, far, wire)
     far.devices.append(wire)
     found = {"camera": wire.path}
     if cell.inertial is not None:
@@ -106,7 +139,8 @@ def streams_of(cell: CellFile, folder: Path, found: Mapping[str, object]) -> Liv
     def link(name: str, port: str, baud: int, what: str) -> SerialPort:
         return SerialPort(str(found.get(name, port)), baud, what)
 
-    streams = LiveStreams(camera_of(cell, folder, link("camera", _camera(cell).port, DEFAULT_BAUD, CAMERA)))
+    port = link("camera", (cell.stereo or _camera(cell)).port, _first_baud(cell), CAMERA)
+    streams = LiveStreams(pair_of(cell.stereo, port) if cell.stereo is not None else camera_of(cell, folder, port))
     if cell.inertial is not None:
         streams.inertial = inertial_of(cell, link("inertial", cell.inertial.port, cell.inertial.baud, INERTIAL))
     return streams

@@ -11,7 +11,7 @@ from docking.config.base import Finite, Fraction, Model, Name, NonNegative, Pose
 from docking.config.buses import CanBus, DriveIdentity, DriveScale, HomingConfig, ModbusBus, SingleAxis
 from docking.config.inputs import CanModule, InputsConfig, ModbusModule
 from docking.config.instruments import GeocomConfig, InertialConfig, NdiConfig
-from docking.config.live import LiveConfig
+from docking.config.live import LiveConfig, StereoConfig
 
 __all__ = [
     "AxisConfig",
@@ -297,6 +297,7 @@ class CellFile(Model):
     name: Name = Field(description="of the cell")
     tracker: TrackerConfig = Field(description="the instrument")
     camera: NdiConfig | None = Field(default=None, description="a camera that streams beside the instrument")
+    stereo: StereoConfig | None = Field(default=None, description="a camera pair instead, for [live]")
     inertial: InertialConfig | None = Field(default=None, description="an inertial sensor on the component")
     live: LiveConfig | None = Field(default=None, description="with it the part is followed in every move")
     bus: CanBus | ModbusBus = Field(discriminator="kind", description="the wire to the axes")
@@ -325,8 +326,8 @@ class CellFile(Model):
         """Nothing but a camera sees what the encoders do not, and an inertial method needs what it integrates."""
         if self.live is None:
             return self
-        if self.camera is None:
-            raise ValueError("[live] needs a [camera]")
+        if (self.camera is None) is (self.stereo is None):
+            raise ValueError("[live] needs a [camera] or a [stereo] pair, and not both")
         if self.live.method not in ("auto", "encoders") and self.inertial is None:
             raise ValueError(f"live.method = {self.live.method!r} needs an [inertial] sensor")
         names = [point.name for point in self.live.points]

@@ -6,7 +6,38 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from docking.config.base import Model, Name, NonNegative, Positive, Vector3
+from docking.config.base import Finite, Model, Name, NonNegative, PoseVector, Positive, Vector3
+
+
+class CameraCalibration(Model):
+    """Calibration of one camera of a pair, and where it stands."""
+
+    width_px: Positive = Field(description="of the image, px")
+    height_px: Positive = Field(description="of the image, px")
+    fx_px: Positive = Field(description="focal length, px")
+    fy_px: Positive = Field(description="focal length, px")
+    cx_px: Positive = Field(description="principal point, px")
+    cy_px: Positive = Field(description="principal point, px")
+    distortion: Annotated[tuple[Finite, ...], Field(min_length=4, max_length=5)] = Field(
+        default=(0.0,) * 5, description="Brown: k1, k2, p1, p2(, k3)"
+    )
+    pose: PoseVector = Field(description="X_W camera, mm and deg; camera axes: x right, y down, z ahead")
+    pixel_sigma: Positive = Field(default=0.2, description="noise of a pixel coordinate, 1 sigma, px")
+
+
+class StereoCameraConfig(CameraCalibration):
+    """One camera of the pair in the cell."""
+
+    name: Name = Field(description="as the lines call it")
+
+
+class StereoConfig(Model):
+    """A calibrated camera pair whose computer sends pixel tracks."""
+
+    port: str = Field(min_length=1, description="any pyserial URL, such as socket://192.168.0.7:4000")
+    baud: Annotated[int, Field(ge=9600, le=4_000_000)] = Field(default=921600, description="line speed, bit/s")
+    rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)] = Field(default=20.0, description="exposures a second")
+    cameras: tuple[StereoCameraConfig, StereoCameraConfig] = Field(description="both, called differently")
 
 
 class LivePoint(Model):
@@ -17,7 +48,7 @@ class LivePoint(Model):
 
 
 class LiveConfig(Model):
-    """The part is followed during every move; `camera` has to be there."""
+    """The part is followed during every move; `camera` or `stereo` has to be there."""
 
     method: Literal["auto", "encoders", "ins", "repaired", "published"] = Field(
         default="auto", description="what follows the points; auto: the encoders' pose, corrected by what is seen"

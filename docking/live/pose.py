@@ -17,7 +17,7 @@ import numpy as np
 from docking.errors import DockingError, LiveDeviation, PoseUncertain
 from docking.kinematics import pose_from_axes
 from docking.live.planned import PlannedPoses, ReadBacks
-from docking.live.seen import SeenPoints, seen_points
+from docking.live.seen import Noise, SeenPoints, seen_points
 from docking.live.settings import LiveSettings, tracker_at_rest
 from docking.pose.batch import fit_poses
 from docking.sightings import InertialSample, PointFrame
@@ -57,6 +57,7 @@ class LivePose:
         self.figures = LiveFigures()
         self.tracker: Tracker | None = None
         self.error: DockingError | None = None
+        self._noise = Noise(settings.sigma_mm, settings.match_mm)
         self._read_backs = ReadBacks()
         self._waiting: deque[PointFrame] = deque()
         self._samples: deque[InertialSample] = deque(maxlen=4000)
@@ -124,7 +125,7 @@ class LivePose:
         expected_T = self._s.X_WT.inverse().apply(X_WC.apply(self._body.points_B_mm))
         places: dict[int, list[Array]] = {}
         for frame in self._waiting:
-            seen = seen_points(frame, self._body, self._s.tools, expected_T, self._s.match_mm)
+            seen = seen_points(frame, self._body, self._s.tools, expected_T, self._noise)
             for row, p in zip(seen.rows, seen.xyz_mm, strict=True):
                 places.setdefault(int(row), []).append(p)
         rows = [i for i, seen_at in sorted(places.items()) if len(seen_at) >= LEAST_FRAMES]
@@ -157,18 +158,17 @@ class LivePose:
         X_plan = self._planned.at(q_mm) if self._planned is not None else pose_from_axes(self._s.positioners, q_mm)
         expected_W = X_plan.apply(self._body.points_B_mm)
         to_T = self._X_WT.inverse()
-        in_T = seen_points(frame, self._body, self._s.tools, to_T.apply(expected_W), self._s.match_mm)
-        seen = SeenPoints(in_T.rows, self._X_WT.apply(in_T.xyz_mm))
+        in_T = seen_points(frame, self._body, self._s.tools, to_T.apply(expected_W), self._noise)
+        seen = in_T.moved(self._X_WT)
         before, self._q_before = self._q_before, q_mm
         resting = before is None or float(np.abs(q_mm - before).max()) <= RESTING_MM
         if self._frames.frozen(seen.xyz_mm, resting):
-            seen = SeenPoints(seen.rows[:0], seen.xyz_mm[:0])
+            seen = seen.without({int(row) for row in seen.rows})
         pairs = swapped(expected_W[seen.rows], seen.xyz_mm, self._s.match_mm)
         named = [(int(seen.rows[i]), int(seen.rows[j])) for i, j in pairs]
         self._frames.tell_swapped(self._body.names, named)
         seen, X_seen = self._agreeing(seen.without({i for pair in named for i in pair}))
-        cov = np.tile(self._s.sigma_mm**2 * np.eye(3), (len(seen.rows), 1, 1))
-        self.tracker.points(t_s, tuple(self._body.names[i] for i in seen.rows), seen.xyz_mm, cov)
+        self.tracker.points(t_s, tuple(self._body.names[i] for i in seen.rows), seen.xyz_mm, seen.cov_mm2)
         if len(seen.rows) == 0:
             self.figures.ignored += 1
             return
@@ -181,11 +181,12 @@ class LivePose:
         pose by them; None for the pose where they are too few."""
         while len(seen.rows) >= FOR_A_POSE:
             nominal = self._body.points_B_mm[seen.rows]
-            fitted = fit_poses(nominal, seen.xyz_mm[None])
+            sigma_mm = np.sqrt(np.linalg.eigvalsh(seen.cov_mm2)[:, -1])
+            fitted = fit_poses(nominal, seen.xyz_mm[None], sigma_mm**-2)
             X_seen = Pose(fitted.R[0], fitted.t_mm[0])
             gaps = np.linalg.norm(seen.xyz_mm - X_seen.apply(nominal), axis=1)
             worst = int(np.argmax(gaps))
-            if len(gaps) == FOR_A_POSE or gaps[worst] <= BAD_POINT_SIGMAS * self._s.sigma_mm:
+            if len(gaps) == FOR_A_POSE or gaps[worst] <= BAD_POINT_SIGMAS * sigma_mm[worst]:
                 return seen, X_seen
             seen = seen.without({int(seen.rows[worst])})
         return seen, None

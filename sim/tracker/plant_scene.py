@@ -47,3 +47,11 @@ def mounted_pose(plant: Plant, mount: PoseVector, t_s: float) -> tuple[Array, Ar
     """
     pose = plant.component_pose_W() @ pose_of(mount)
     return pose.R @ TO_SENSOR.T, pose.t_mm
+
+
+def points_on_part(plant: Plant, points: Mapping[str, Place], targets: tuple[str, ...], t_s: float) -> dict[str, Array]:
+    """Where points (3,) of the component frame and reflectors are in W, by name."""
+    pose = plant.component_pose_W()
+    known, places = plant.target_names(), plant.targets_W_mm(t_s)
+    found: dict[str, Array] = {name: pose.apply(np.array(place)) for name, place in points.items()}
+    return found | {name: places[known.index(name)] for name in targets}

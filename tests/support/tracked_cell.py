@@ -24,7 +24,8 @@ LOOK_S = 0.05
 
 
 class TrackedCell(DryCell):
-    """One docking of lab-can-tracked; `live` overrides keys of `[live]`, `events` happen as in a scenario file.
+    """One docking of lab-can-tracked; `live` overrides keys of `[live]`, its key `stereo` puts a camera pair in the
+    place of the camera; `events` happen as in a scenario file.
 
     `seen`: a row every 50 ms in a move: move, loop time, blind time (s), change since rest of the largest error of a
     point (mm, against the plant), predicted sd (mm).
@@ -33,7 +34,11 @@ class TrackedCell(DryCell):
     def __init__(self, seed: int, journal: Path, events: list[dict[str, Any]], live: dict[str, Any]) -> None:
         super().__init__("lab-can-tracked", seed, journal)
         assert self.cell.live is not None
-        self.cell = self.cell.model_copy(update={"live": self.cell.live.model_copy(update=live)})
+        stereo = live.pop("stereo", None)
+        changed: dict[str, Any] = {"live": self.cell.live.model_copy(update=live)}
+        if stereo is not None:
+            changed |= {"camera": None, "stereo": stereo}
+        self.cell = self.cell.model_copy(update=changed)
         self.events = [EventModel.model_validate(event) for event in events]
         self.seen: list[tuple[int, float, float, float, float]] = []
 
