@@ -18,6 +18,7 @@ from docking.errors import BadArgument, NotLocalised
 from docking.geometry import exp_so3
 from docking.guidance import guided
 from docking.guidance.features import Features, extract, grey
+from docking.guidance.frame_error import FrameError
 from docking.guidance.marker_pose import locate_by_markers
 from docking.guidance.opencv import opencv
 from docking.guidance.pose_only import CameraFit, Sights, refine, seen_sigma_mm
@@ -70,8 +71,9 @@ class Localised:
     """The camera in the cell: X_WC, `cov` (6, 6) of [rotation rad, shift mm] in the camera's frame.
 
     `points` map points agree out of `expected` that the pose should see; `rms_px` of those; `depth_mm` their median
-    depth. `map_sigma_mm` is the standard deviation of mapped places, shared by neighbouring points; `generation` is 0
-    where the points were in the map as built, and grows with those that tracking added.
+    depth. `map_sigma_mm` is the standard deviation of mapped places, shared by neighbouring points; `frame` what it is
+    more away from the markers (None for a pose from markers). `generation` is 0 where the points were in the map as
+    built, and grows with those that tracking added.
     `feature_rows`, `point_rows` say which features of the image are which points of the map.
     """
 
@@ -85,6 +87,7 @@ class Localised:
     map_sigma_mm: float
     generation: float
     camera: Camera
+    frame: FrameError | None = None
     features: Features | None = None
     feature_rows: Rows = field(default_factory=lambda: np.zeros(0, np.intp))
     point_rows: Rows = field(default_factory=lambda: np.zeros(0, np.intp))
@@ -95,8 +98,8 @@ class Localised:
         Without a point: at the median depth of the points seen, on the optical axis.
         """
         p_C = np.array([0.0, 0.0, self.depth_mm]) if p_W_mm is None else self.X_WC.inverse().apply(p_W_mm)
-        seen = seen_sigma_mm(self.cov, p_C)
-        return COVERAGE * float(np.hypot(seen, self.map_sigma_mm))
+        away = 0.0 if self.frame is None else self.frame.away_sigma_mm(self.X_WC.apply(p_C))
+        return COVERAGE * float(np.linalg.norm([seen_sigma_mm(self.cov, p_C), self.map_sigma_mm, away]))
 
     def corner_error_mm(self) -> float:
         """The predicted error at the worst corner of the picture, at the median depth, by this picture alone.
@@ -140,6 +143,7 @@ class Localiser:
         self.index = ar_map if isinstance(ar_map, Indexed) else indexed(ar_map)
         self.camera = camera or self.index.ar_map.camera
         self.settings = settings or LocaliseSettings()
+        self._frame = FrameError.of(self.index.ar_map)
 
     @property
     def ar_map(self) -> ArMap:
@@ -269,10 +273,10 @@ class Localiser:
         if _second_pose(self.camera, fit, guided.sights(self.ar_map, features, rows, points)):
             raise self._refused("two poses fit what is seen, turned about the part in view", count, s.least_points)
         generation = float(np.mean(self.index.generation[points[inside]]))
-        sigma = max(s.map_sigma_mm, self.ar_map.quality.marker_rms_mm or 0.0) * float((1.0 + generation) ** 1.5)
+        sigma = max(s.map_sigma_mm, self._frame.rms_mm) * float((1.0 + generation) ** 1.5)
         found = Localised(
             fit.X_WC, fit.cov, "map", count, expected, fit.rms_px, depth, sigma, generation,
-            self.camera, features, rows[inside], points[inside],
+            self.camera, self._frame, features, rows[inside], points[inside],
         )  # fmt: skip
         reach = found.corner_error_mm()
         if not reach <= _LIMITS * s.limit_mm:

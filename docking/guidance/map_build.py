@@ -38,6 +38,9 @@ METHODS: tuple[Method, ...] = ("published", "joint", "single-aruco")
 BUILDERS: tuple[Builder, ...] = ("own", "colmap", "tum")
 _LEAST_SPAN = 0.5
 _DOUBTFUL_RMS_MM = 3.0
+_STRAIN_SIGMAS, _LEAST_STRAIN_MM, _HIDDEN = 3.0, 0.4, 10.0
+"""Circles of a joint map further from the survey than so many sigmas (at least so many mm) strain it; a group that was
+moved by 10 mm leaves 1 mm at its circles."""
 _PLACE = {"published": published, "joint": joint, "single-aruco": single_aruco}
 
 
@@ -157,10 +160,24 @@ def _quality(
         reset_keyframes=tuple(ar_map.keyframes[row].name for row in placed.reset),
         scale=placed.scale,
         marker_rms_mm=None if isnan(rms) else rms,
+        doubt_mm=_doubt_mm(placed, layout, quality.method, rms),
         reprojection_rms_px=reprojection_rms_px(ar_map),
         build_s=scanned.build_s,
         notices=(*scanned.notices, *named, *placed.notices, *_doubts(placed, layout, quality.method, rms)),
     )
+
+
+def _doubt_mm(placed: Placed, layout: MarkerLayout, method: str, rms_mm: float) -> float:
+    """How far off the frame may be where markers contradict each other, or the pictures contradict the survey."""
+    if placed.registered is None:
+        return 0.0
+    return max(placed.registered.doubt_mm, _strained_mm(layout, rms_mm) if method == "joint" else 0.0)
+
+
+def _strained_mm(layout: MarkerLayout, rms_mm: float) -> float:
+    """What a joint map may hide: it bends to a wrong survey, and leaves a tenth of the error at the circles."""
+    allowed_mm = max(_LEAST_STRAIN_MM, _STRAIN_SIGMAS * float(np.sqrt(np.mean(np.sum(layout.sigma_mm**2, axis=2)))))
+    return 0.0 if isnan(rms_mm) or rms_mm <= allowed_mm else _HIDDEN * rms_mm
 
 
 def _doubts(placed: Placed, layout: MarkerLayout, method: str, rms_mm: float) -> tuple[str, ...]:
@@ -172,6 +189,19 @@ def _doubts(placed: Placed, layout: MarkerLayout, method: str, rms_mm: float) ->
     cameras = np.array([frame.X_WC.t_mm for frame in placed.ar_map.keyframes])
     span, size = (float(np.linalg.norm(np.ptp(points, axis=0))) for points in (known, cameras))
     doubts = []
+    apart_mm, strained_mm = 0.0 if placed.registered is None else placed.registered.doubt_mm, 0.0
+    if method == "joint":
+        strained_mm = _strained_mm(layout, rms_mm)
+    if strained_mm > 0.0:
+        doubts.append(
+            f"the circles lie {rms_mm:.2f} mm rms from their survey, more than its sigmas allow: "
+            "some have moved together, or the survey is worse than it says"
+        )
+    if apart_mm > 0.0:
+        doubts.append(
+            f"markers that agree with each other lie {apart_mm:.0f} mm from where the others put them: moved together, "
+            "or the map is bent (calibration?). Scan again, or take the moved ones out of the survey"
+        )
     if span < _LEAST_SPAN * size:
         doubts.append(f"the markers span {span:.0f} mm of a scan of {size:.0f} mm: far from them the frame is a guess")
     if not (rms_mm <= _DOUBTFUL_RMS_MM):
@@ -193,6 +223,7 @@ def map_json(ar_map: ArMap) -> dict[str, Any]:
         "reset_keyframes": list(quality.reset_keyframes),
         "scale": quality.scale,
         "marker_rms_mm": quality.marker_rms_mm,
+        "doubt_mm": quality.doubt_mm,
         "reprojection_rms_px": quality.reprojection_rms_px,
         "build_s": quality.build_s,
         "optimise_s": quality.optimise_s,

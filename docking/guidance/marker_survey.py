@@ -6,6 +6,7 @@ A marker that was moved, swapped or typed wrongly is named and left out; where n
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,11 +57,15 @@ class Circles:
 
 @dataclass(frozen=True, eq=False)
 class Registered:
-    """The similarity, the circles that agree with it, and why the others do not (marker id -> words)."""
+    """The similarity, the circles that agree with it, and why the others do not (marker id -> words).
+
+    `doubt_mm`: how far off markers are that agree with each other but not with the majority, 0 without such.
+    """
 
     similarity: Similarity
     circles: Circles
     rejected: dict[int, str]
+    doubt_mm: float = 0.0
 
     @property
     def markers(self) -> tuple[int, ...]:
@@ -142,7 +147,27 @@ def register(ar_map: ArMap, layout: MarkerLayout, sightings: Sightings, settings
         cause = f"only {int(agree.sum())} of {len(agree)} circles agree within {tolerance_mm:.1f} mm; "
         raise MarkersDisagree("markers", cause + "; ".join(f"marker {i}: {why}" for i, why in rejected.items()))
     kept = Circles(*(column[agree] for column in (circles.marker, circles.circle, circles.points, circles.known_mm)))
-    return Registered(refined(similarity, kept.points, kept.known_mm), kept, rejected)
+    doubt_mm = _doubt_mm(circles, similarity, settings, set(rejected))
+    return Registered(refined(similarity, kept.points, kept.known_mm), kept, rejected, doubt_mm)
+
+
+def _doubt_mm(circles: Circles, similarity: Similarity, settings: RegistrationSettings, rejected: set[int]) -> float:
+    """How far off rejected markers are of which two form the figure of the survey.
+
+    One marker alone was moved; two that moved alike stand on something that moved, or the map is bent between them and
+    the majority. Nobody can say which, so the frame is not better than that anywhere.
+    """
+    moved = similarity.apply(circles.points)
+    doubt = 0.0
+    for a, b in combinations(sorted(rejected), 2):
+        mine = (circles.marker == a) | (circles.marker == b)
+        if not all(np.count_nonzero(circles.marker == i) >= 2 for i in (a, b)):
+            continue
+        known = circles.known_mm[mine]
+        extent = float(np.linalg.norm(np.ptp(known, axis=0)))
+        if _shape_error(moved[mine], known) <= settings.near_tolerance_mm + settings.drift_share * extent:
+            doubt = max(doubt, float(np.linalg.norm(moved[mine] - known, axis=1).max()))
+    return doubt
 
 
 def _refuse_other_unit(layout: MarkerLayout) -> None:

@@ -127,8 +127,9 @@ class KeyFrame:
 class MapQuality:
     """What the build found out. `notices` are sentences a person must see (fallbacks, rejected markers).
 
-    `markers_used` ids that set the frame; `markers_rejected` id -> why; `reset_keyframes` names of the key-frames that
-    qualified for a new pose from circles alone; `scale` mm for one unit of the free map.
+    `doubt_mm` how far markers that agree with each other lie from where the majority puts them: moved together, or the
+    map is bent. `markers_used` ids that set the frame; `markers_rejected` id -> why; `reset_keyframes` names of the
+    key-frames that qualified for a new pose from circles alone; `scale` mm for one unit of the free map.
     """
 
     method: str = "free"
@@ -137,6 +138,7 @@ class MapQuality:
     reset_keyframes: tuple[str, ...] = ()
     scale: float = 1.0
     marker_rms_mm: float | None = None
+    doubt_mm: float = 0.0
     reprojection_rms_px: float = 0.0
     build_s: float = 0.0
     optimise_s: float = 0.0

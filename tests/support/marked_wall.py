@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from docking.geometry import exp_so3
 from docking.guidance.detection import MarkerSighting
@@ -67,7 +68,7 @@ def _inside(pixels: Array) -> Array:
     return np.where(inside[:, None], pixels, np.nan)
 
 
-def _key_frame(i: int, X: Pose, pixels: Array, seen: Array, rng: np.random.Generator) -> KeyFrame:
+def _key_frame(i: int, X: Pose, pixels: Array, seen: NDArray[np.intp], rng: np.random.Generator) -> KeyFrame:
     count = len(seen)
     descriptors = rng.integers(0, 256, (count, 32), dtype=np.uint8)
     return KeyFrame(f"{i:04d}.png", 0.1 * i, X, pixels, np.zeros(count, np.int32), descriptors, seen.astype(np.int32))
