@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -68,6 +69,19 @@ def guided_cell() -> GuidedCell:
     )
     settings = MethodSettings(camera_sigma=None)
     return GuidedCell(scenery, layout, place(Scanned(free, tuple(seen), 0.0), layout, "joint", settings))
+
+
+def left_half() -> ArMap:
+    """The map without the key-frames of the right half, and without the points that only they see."""
+    ar_map = guided_cell().ar_map
+    kept = [f for f in ar_map.keyframes if f.X_WC.t_mm[0] < 150.0]
+    used = np.unique(np.concatenate([f.landmarks[f.landmarks >= 0] for f in kept]))
+    rows = np.full(len(ar_map.points_mm), -1, np.int32)
+    rows[used] = np.arange(len(used))
+    frames = tuple(
+        replace(f, landmarks=np.where(f.landmarks >= 0, rows[f.landmarks], -1).astype(np.int32)) for f in kept
+    )
+    return replace(ar_map, keyframes=frames, points_mm=ar_map.points_mm[used], descriptors=ar_map.descriptors[used])
 
 
 def picture(X_WC: Pose, seed: int = 9, **shake: float) -> Image:

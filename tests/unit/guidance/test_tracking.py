@@ -10,8 +10,7 @@ import pytest
 from docking.errors import MapFrameDiffers, NotLocalised
 from docking.guidance.localiser import Localiser, LocaliseSettings, indexed
 from docking.guidance.tracking import Tracker
-from docking.guidance.types import ArMap
-from tests.support.guided_cell import guided_cell, picture, view
+from tests.support.guided_cell import guided_cell, left_half, picture, view
 
 MAP_ONLY = LocaliseSettings(by_markers=False)
 
@@ -20,19 +19,6 @@ def walk(count: int, start_mm: float = 0.0, step_mm: float = 90.0) -> list[tuple
     """(name, t, picture, true place) along the wall."""
     views = [view(start_mm + step_mm * k, 1000.0, 780.0, 20.0) for k in range(count)]
     return [(f"{k}", k / 10.0, picture(X, seed=k), X.t_mm) for k, X in enumerate(views)]
-
-
-def left_half() -> ArMap:
-    """The map without the key-frames of the right half, and without the points that only they see."""
-    ar_map = guided_cell().ar_map
-    kept = [f for f in ar_map.keyframes if f.X_WC.t_mm[0] < 150.0]
-    used = np.unique(np.concatenate([f.landmarks[f.landmarks >= 0] for f in kept]))
-    rows = np.full(len(ar_map.points_mm), -1, np.int32)
-    rows[used] = np.arange(len(used))
-    frames = tuple(
-        replace(f, landmarks=np.where(f.landmarks >= 0, rows[f.landmarks], -1).astype(np.int32)) for f in kept
-    )
-    return replace(ar_map, keyframes=frames, points_mm=ar_map.points_mm[used], descriptors=ar_map.descriptors[used])
 
 
 def test_lost_and_found_again() -> None:
