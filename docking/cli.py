@@ -32,7 +32,7 @@ from docking.errors import (
     DockingError,
     StoppedByOperator,
 )
-from docking.terminal import FILE, json_option, language, print_json, print_text, transcript_option
+from docking.terminal import FILE, json_option, language, print_json, print_text, transcript_option, wire_choice
 from docking.words import tell
 
 EXIT_OF_OUTCOME = {
@@ -161,15 +161,14 @@ def run(as_json: bool, step: bool, sim: bool, wires: Path | None, transcript: Pa
     """
     from docking import assemble
 
-    if wires is not None and not sim:
-        raise BadArgument("--wires", "addresses of simulated devices need --sim", value=str(wires))
+    choice = wire_choice(sim, wires)
     if not step and not sim:
         raise BadArgument("run", "real devices are docked step by step; add --step", value="unattended motion")
     wanted = assemble.RunRequest(
         request["cell"], request["job"], request["seed"], request["report"], request["journal"], language()
     )
     wanted = replace(wanted, transcript=transcript)
-    summary = assemble.run_on_wires(wanted, assemble.WireChoice(sim, wires), _say(as_json), step=step)
+    summary = assemble.run_on_wires(wanted, choice, _say(as_json), step=step)
     return _ended(summary, as_json)
 
 
@@ -194,11 +193,10 @@ def relieve(as_json: bool, supervisor: str, after: Path | None, sim: bool, wires
 
     if not supervisor.strip():
         raise BadArgument("--supervisor", "who asks for the steps must have a name", value=supervisor)
-    if wires is not None and not sim:
-        raise BadArgument("--wires", "addresses of simulated devices need --sim", value=str(wires))
+    choice = wire_choice(sim, wires)
     run = assemble.RunRequest(request["cell"], request["job"], request["seed"], None, request["journal"], language())
     wanted = assemble.ReliefRequest(run, supervisor.strip(), after)
-    summary = assemble.relieve(wanted, assemble.WireChoice(sim, wires), _say(as_json))
+    summary = assemble.relieve(wanted, choice, _say(as_json))
     if as_json:
         print_json(summary)
     else:

@@ -8,13 +8,12 @@ from typing import Any
 
 import click
 
-from docking.errors import EXIT_FAULT, EXIT_OK, BadArgument
-from docking.terminal import FILE, json_option, print_json, print_text, transcript_option
+from docking.errors import EXIT_FAULT, EXIT_OK
+from docking.terminal import FILE, Range, json_option, print_json, print_text, transcript_option, wire_choice
 
 WIRES = "Addresses that `docking sim` wrote; without it --sim starts its own devices."
 SILENCE = "The drives will miss their controller on purpose. Everything stands, braked, and nothing hangs on a servo?"
 CLEAR = "\x1b[H\x1b[J"
-SHORTEST_S = 0.1
 
 
 @click.command()
@@ -69,7 +68,7 @@ def devices(
 @click.argument("cell", type=FILE)
 @click.option("--sim", is_flag=True, help="Look at simulated devices on real wires.")
 @click.option("--wires", type=FILE, help=WIRES)
-@click.option("--seconds", type=click.FloatRange(min=SHORTEST_S), help="End after so long (default: with Ctrl-C).")
+@click.option("--seconds", type=Range(min=0.1), help="End after so long (default: with Ctrl-C).")
 @transcript_option
 @json_option
 def monitor(
@@ -86,9 +85,6 @@ def monitor(
     from docking.assemble.monitoring import monitor as watch
     from docking.assemble.monitoring import monitor_text
 
-    # The range of click lets NaN pass.
-    if seconds is not None and not (seconds >= SHORTEST_S):
-        raise BadArgument("--seconds", f"{SHORTEST_S:g} or more", value=seconds)
     screen = CLEAR if sys.stdout.isatty() else ""
 
     def show(values: dict[str, Any]) -> None:
@@ -103,8 +99,5 @@ def monitor(
 
 def _request(cell: Path, sim: bool, wires: Path | None, transcript: Path | None) -> Any:
     from docking.assemble.looking import LookRequest
-    from docking.assemble.requests import WireChoice
 
-    if wires is not None and not sim:
-        raise BadArgument("--wires", "addresses of simulated devices need --sim", value=str(wires))
-    return LookRequest(cell, WireChoice(sim, wires), transcript=transcript)
+    return LookRequest(cell, wire_choice(sim, wires), transcript=transcript)

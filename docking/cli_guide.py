@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from docking.errors import EXIT_OK, EXIT_OUT_OF_TOLERANCE, BadArgument
-from docking.terminal import FILE, json_option, language, print_json, print_text
+from docking.terminal import FILE, Range, json_option, language, print_json, print_text
 
 
 @click.group()
@@ -70,7 +70,7 @@ def markers(out: Path, page: str, as_json: bool, **marker: Any) -> int:
     help="own: from the images alone; colmap, tum: with the poses that another program found (--model).",
 )
 @click.option("--model", type=FILE, help="Folder of a COLMAP model (text or binary), or a TUM trajectory file.")
-@click.option("--fps", type=click.FloatRange(min=0.01), default=10.0, show_default=True, help="Images of a folder a s.")
+@click.option("--fps", type=Range(min=0.01), default=10.0, show_default=True, help="Images of a folder a s.")
 @click.option(
     "--gate", metavar="MM,DEG,CIRCLES", default="500,15,4", show_default=True, help="Markers taken (published)."
 )

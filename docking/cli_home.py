@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from docking.errors import EXIT_OK, BadArgument
-from docking.terminal import FILE, json_option, print_json, print_text, transcript_option
+from docking.errors import EXIT_OK
+from docking.terminal import FILE, json_option, print_json, print_text, transcript_option, wire_choice
 
 WARNING = "The axes move by themselves. Nothing rests on {names}, and everybody is clear of them?"
 
@@ -41,13 +41,11 @@ def home(
     """
     from docking.assemble.homing import HomeRequest, home_axes, home_text
     from docking.assemble.looking import LookRequest
-    from docking.assemble.requests import WireChoice
 
-    if wires is not None and not sim:
-        raise BadArgument("--wires", "addresses of simulated devices need --sim", value=str(wires))
+    choice = wire_choice(sim, wires)
     if not (sim or yes):
         click.confirm(WARNING.format(names=", ".join(positioners) or "any positioner"), abort=True, err=True)
-    look = LookRequest(cell, WireChoice(sim, wires), transcript=transcript)
+    look = LookRequest(cell, choice, transcript=transcript)
     report = home_axes(HomeRequest(look, positioners, free))
     if as_json:
         print_json(report)

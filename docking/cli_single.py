@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from docking.errors import EXIT_OK, BadArgument
-from docking.terminal import FILE, json_option, print_json, print_text
+from docking.errors import EXIT_OK
+from docking.terminal import FILE, json_option, print_json, print_text, wire_choice
 
 WARNING = "{name} moves, and goes on when this computer falls silent: it has no watchdog. Everybody clear of it?"
 
@@ -37,14 +37,12 @@ def single(
     Example: docking single cell.toml platform-left 250
     """
     from docking.assemble.looking import LookRequest
-    from docking.assemble.requests import WireChoice
     from docking.assemble.single import move_single
 
-    if wires is not None and not sim:
-        raise BadArgument("--wires", "addresses of simulated devices need --sim", value=str(wires))
+    choice = wire_choice(sim, wires)
     if not (sim or yes):
         click.confirm(WARNING.format(name=name), abort=True, err=True)
-    report = move_single(LookRequest(cell, WireChoice(sim, wires)), name, target_mm, speed)
+    report = move_single(LookRequest(cell, choice), name, target_mm, speed)
     if as_json:
         print_json(report)
     else:

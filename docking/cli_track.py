@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from docking.errors import EXIT_FAULT, EXIT_OK, BadArgument
-from docking.terminal import FILE, json_option, print_json, print_text
+from docking.terminal import FILE, Range, json_option, print_json, print_text, wire_choice
 
 CLEAR = "\x1b[H\x1b[J"
 METHODS = ("published", "repaired", "ins", "ins-smoothed", "encoders", "auto")
@@ -37,7 +37,7 @@ GRADES = ("tactical", "mems", "adis16448", "consumer")
 )
 @click.option("--plot", type=FILE, help="Draw path, error and predicted error into this HTML file.")
 @click.option("--live", is_flag=True, help="FILES is one CELL file: show the pose of its part by its devices.")
-@click.option("--seconds", type=click.FloatRange(min=0.1), help="With --live: end after so long (default: Ctrl-C).")
+@click.option("--seconds", type=Range(min=0.1), help="With --live: end after so long (default: Ctrl-C).")
 @click.option("--sim", is_flag=True, help="With --live: look at simulated devices on real wires.")
 @click.option("--wires", type=FILE, help="With --live --sim: addresses that `docking sim` wrote.")
 @json_option
@@ -99,20 +99,18 @@ def _bodies(files: tuple[Path, ...], options: dict[str, object], plot: Path | No
 def _live(files: tuple[Path, ...], options: dict[str, object], as_json: bool) -> int:
     from docking.assemble.live_look import live_text, look_live
     from docking.assemble.looking import LookRequest
-    from docking.assemble.requests import WireChoice
 
     if len(files) != 1:
         raise BadArgument("--live", "one CELL file is needed", value=len(files), limit=1)
-    wires, sim, seconds = options["wires"], bool(options["sim"]), options["seconds"]
-    if wires is not None and not sim:
-        raise BadArgument("--wires", "addresses of simulated devices need --sim", value=str(wires))
+    wires, seconds = options["wires"], options["seconds"]
+    choice = wire_choice(bool(options["sim"]), wires if isinstance(wires, Path) else None)
     screen = CLEAR if sys.stdout.isatty() else ""
 
     def show(values: dict[str, Any]) -> None:
         if not as_json:
             print_text(screen + live_text(values))
 
-    request = LookRequest(files[0], WireChoice(sim, wires if isinstance(wires, Path) else None))
+    request = LookRequest(files[0], choice)
     values = look_live(request, seconds if isinstance(seconds, float) else None, show)
     if as_json:
         print_json(values)
@@ -131,20 +129,29 @@ def _refuse_without_live(options: dict[str, object]) -> None:
     "--runs", type=click.IntRange(min=1), default=24, show_default=True, help="Runs of four gaps for a grade."
 )
 @click.option("--workers", type=click.IntRange(min=1), help="Processes (default: one a core).")
+@click.option("--report", type=FILE, help="Write distributions and table to this HTML file.")
 @json_option
-def study_tracking(runs: int, workers: int | None, as_json: bool) -> int:
+def study_tracking(runs: int, workers: int | None, report: Path | None, as_json: bool) -> int:
     """Simulate moving bodies and see what every method makes of gaps of 3 s, for four grades of inertial sensor.
 
     Says where the published claim (1 to 2 cm kept through 3 s) holds. Exits with 1 when a bar is missed.
 
     \b
-    Example: docking study tracking --runs 24
+    Example: docking study tracking --runs 24 --report tracking.html
     """
     from docking.study_tracking import study_text, study_tracking
 
     if workers is not None and not workers >= 1:
         raise BadArgument("--workers", "at least one is needed", value=workers, limit=1)
+    if report is not None:
+        from docking.report.sheet import check_drawing
+
+        check_drawing()
     result = study_tracking(runs, workers, lambda text: print_text(text, err=as_json))
+    if report is not None:
+        from docking.report.tracking_study_page import write_tracking_study_page
+
+        write_tracking_study_page(result, report)
     if as_json:
         print_json(result)
     else:

@@ -3,14 +3,39 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from docking.errors import BadArgument
+
+if TYPE_CHECKING:
+    from docking.assemble.requests import WireChoice
+
 FILE = click.Path(path_type=Path)
+
+
+class Range(click.FloatRange):
+    """A range of numbers; NaN, which the bounds of click let pass, is in none."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        number = float(super().convert(value, param, ctx))
+        if math.isnan(number):
+            self.fail(f"{value} is no number.", param, ctx)
+        return number
+
+
+def wire_choice(sim: bool, wires: Path | None) -> WireChoice:
+    """What `--sim` and `--wires` say together. Raises BadArgument for addresses without `--sim`."""
+    from docking.assemble.requests import WireChoice
+
+    if wires is not None and not sim:
+        raise BadArgument("--wires", "addresses of simulated devices need --sim", value=str(wires))
+    return WireChoice(sim, wires)
 
 
 def language() -> str:

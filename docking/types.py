@@ -225,8 +225,8 @@ class PlanBounds(_Frozen):
     """What the pre-flight foresees of a plan; (m,) in the order of its axes.
 
     `peak_mm_s` (m,); `quick_stop_s` in which all axes ramp down together with a_quick. If an axis jams at its peak
-    speed the worst ball parts by `jam_mm` (m,) and feels `jam_n` (m,), and the part is warped by `jam_warp_n` (m,); if it
-    ramps down by itself, the worst ball parts by `ramp_mm` (m,).
+    speed the worst ball parts by `jam_mm` (m,) and feels `jam_n` (m,), and the part is warped by `jam_warp_n` (m,); if
+    it ramps down by itself, the worst ball parts by `ramp_mm` (m,).
     `residual_mm`, `force_n`, `warp_n`: largest at any instant from the devices' straight interpolation between two rows
     and from their start and clock differences. `clearance_mm` from the mate where it least exceeds what is asked, at
     path coordinate `clearance_s`, asked there `clearance_asked_mm`, all NaN where nothing is declared. `limits`: each

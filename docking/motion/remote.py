@@ -34,8 +34,8 @@ class LeaseSettings:
 class RemoteMotion:
     """`docking.ports.Motion` over a channel; renews the lease from `connect` to `close`.
 
-    `on_feedback` hears every read-back when it comes. `tell(what, body)` hears `hello`, `lateness` and `said` of the motion side. `explain(reason)` is called when it is
-    gone: it makes sure of that and says how it ended.
+    `on_feedback` hears every read-back when it comes. `tell(what, body)` hears `hello`, `lateness` and `said` of the
+    motion side. `explain(reason)` is called when it is gone: it makes sure of that and says how it ended.
     """
 
     def __init__(
