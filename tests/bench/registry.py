@@ -6,6 +6,7 @@ from tests.bench import (
     bundle_adjustment,
     can_frames,
     fault_reaction,
+    guidance_speed,
     modbus_wire,
     planning,
     pose_fit,
@@ -33,4 +34,5 @@ GROUPS: dict[str, Group] = {
     "P12": study.measure,
     "P13": tracking.measure,
     "P17": bundle_adjustment.measure,
+    "P18": guidance_speed.measure,
 }

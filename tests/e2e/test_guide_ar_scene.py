@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from itertools import islice
 
+import numpy as np
 import pytest
 
+from docking.errors import OverlayUncertain
 from docking.guidance.images import pictures
 from docking.guidance.input_files import read_layout
 from docking.guidance.localiser import Localiser, LocaliseSettings
 from docking.guidance.map_build import BuildRequest, Method, Scanned, place, scan
 from docking.guidance.map_methods import MethodSettings
+from docking.guidance.overlay import draw
+from docking.guidance.scene import Scene
 from docking.guidance.tracking import Tracker
 from docking.guidance.trajectory import Trajectory, TrajectoryError, read_tum, trajectory_error
 from docking.guidance.types import MarkerLayout
@@ -49,6 +54,30 @@ def test_the_joint_map_is_right_to_three_millimetres_and_six_times_better_than_o
     assert joint.max_m <= 6.0e-3
     assert single.ate_rmse_m <= 25e-3
     assert single.ate_rmse_m >= 6.0 * joint.ate_rmse_m
+
+
+def test_markers_in_one_corner_promise_less_the_further_away() -> None:
+    """The frame runs away from three markers of nine; what is drawn there would be off, and is refused in time."""
+    free, layout = scanned()
+    kept = (0, 1, 2)
+    corner = replace(layout, ids=kept, circles_mm=layout.circles_mm[:3], sigma_mm=layout.sigma_mm[:3])
+    localiser = Localiser(place(free, corner, "joint", MethodSettings()), settings=LocaliseSettings(by_markers=False))
+    folder = shared_data("ar_scene")
+    truth = read_tum(folder / "truth_test.tum")
+    promised = []
+    for picture in islice(pictures(folder / "test"), 4, None, 18):
+        found = localiser.localise(picture.image)
+        promised.append(found.predicted_error_mm())
+        X_true = truth.pose(int(np.argmin(np.abs(truth.t_s - picture.t_s))))
+        there = np.array([[0.0, 0.0, 1.0], [0.3, 0.2, 1.0], [-0.3, -0.2, 1.0]]) * found.depth_mm
+        drawn = found.X_WC.inverse().apply(X_true.apply(there))
+        off_mm = np.linalg.norm(drawn[:, :2] / drawn[:, 2:] - there[:, :2] / there[:, 2:], axis=1) * found.depth_mm
+        assert np.max(off_mm) <= promised[-1]
+    assert promised[0] < 4.0
+    assert promised[-1] > 10.0
+    scene = Scene(found.X_WC.apply(np.array([0.0, 0.0, found.depth_mm])), (), (), (), (), (), {})
+    with pytest.raises(OverlayUncertain):
+        draw(picture.image, found, scene, 10.0)
 
 
 @pytest.mark.full
