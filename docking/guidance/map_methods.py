@@ -38,6 +38,7 @@ HUBER_SIGMAS = 2.0
 CIRCLE_SIGMA_PX = 0.1
 _OUTLIER_SIGMAS = 4.0
 _RESET_PARALLAX_DEG = 2.0
+_FEW_RESETS = 4
 _LEAST_SCALE_BASE = 0.05
 """Distance of the two views that give the scale, against their distance from the marker."""
 
@@ -98,7 +99,9 @@ def published(free: ArMap, layout: MarkerLayout, sightings: Sightings, settings:
         return _placed(placed, registered, (), (notice,))
     frames = tuple(replace(f, X_WC=reset.get(i, f.X_WC)) for i, f in enumerate(placed.keyframes))
     again = _retriangulated(replace(placed, keyframes=frames), sorted(reset))
-    return _placed(_adjusted(again, sorted(reset), settings), registered, tuple(sorted(reset)))
+    few = f"only {len(reset)} key-frames qualify for a reset: away from them the map stays as it drifted"
+    notices = (few,) if len(reset) < _FEW_RESETS else ()
+    return _placed(_adjusted(again, sorted(reset), settings), registered, tuple(sorted(reset)), notices)
 
 
 def joint(free: ArMap, layout: MarkerLayout, sightings: Sightings, settings: MethodSettings) -> Placed:

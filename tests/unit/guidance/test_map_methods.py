@@ -74,6 +74,13 @@ def test_without_a_key_frame_to_reset_published_falls_back_and_says_so(wall: Wal
     assert any("similarity only" in notice for notice in placed.quality.notices)
 
 
+def test_few_key_frames_to_reset_are_told(wall: Wall) -> None:
+    two = tuple(frame if i in (3, 10) else frame[:1] for i, frame in enumerate(wall.sightings))
+    placed = _placed(wall, "published", seen=two)
+    assert 0 < len(placed.quality.reset_keyframes) <= 2
+    assert any("qualify for a reset: away from them" in notice for notice in placed.quality.notices)
+
+
 @pytest.mark.parametrize("method", ["published", "joint"])
 @pytest.mark.parametrize("marker", range(6))
 def test_a_marker_moved_by_20_mm_is_named_and_left_out(wall: Wall, method: Method, marker: int) -> None:
