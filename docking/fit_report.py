@@ -82,11 +82,6 @@ def _noise_known(points: Points) -> bool:
     )
 
 
-def fit_files(nominal_path: str | Path, measured_path: str | Path, method: str = "ml") -> dict[str, Any]:
-    """Screen and fit MEASURED to NOMINAL with no options but the method; the JSON object of `docking fit`."""
-    return fit_json(run_fit(nominal_path, measured_path, FitOptions(method=method)))
-
-
 def centroid_cov(fit: Fit, centroid_M_mm: Array) -> Array:
     """Covariance (6, 6) of [rotation vector in rad about the axes of M, translation in mm of a point (3,) in M]."""
     arm = centroid_M_mm - fit.pivot_mm

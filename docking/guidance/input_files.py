@@ -61,12 +61,6 @@ def _positive(value: object) -> bool:
     return _number(value) and value > 0  # type: ignore[operator]
 
 
-def camera_text(camera: Camera) -> str:
-    """The calibration as the file that `read_camera` reads."""
-    lines = [f"{key} = {getattr(camera, key)!r}" for key in _NEEDED]
-    return "\n".join([*lines, f"distortion = {[float(v) for v in camera.distortion]!r}", ""])
-
-
 def read_layout(path: Path) -> MarkerLayout:
     """Measured circle centres: `marker_id,circle,x_mm,y_mm,z_mm[,sx_mm,sy_mm,sz_mm]`, four rows a marker.
 

@@ -22,11 +22,6 @@ _STRIDE = 16
 Rows = NDArray[np.intp]
 
 
-def signed_distance_mm(points_mm: Array, boxes_mm: Array) -> Array:
-    """Distance (...) of `points_mm` (..., 3) to boxes (..., 2, 3) of the same or broadcast shape; negative inside."""
-    return _distance(points_mm, boxes_mm)[0]
-
-
 def _distance(points_mm: Array, boxes_mm: Array) -> tuple[Array, Array]:
     """Signed distance (...) and its gradient (..., 3)."""
     low, high = boxes_mm[..., 0, :], boxes_mm[..., 1, :]

@@ -3,6 +3,7 @@
 import json
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from docking.errors import BadArgument, ConfigError
-from docking.fit_report import fit_files, fit_text
+from docking.fit_options import FitOptions
+from docking.fit_report import fit_json, fit_text, run_fit
 from docking.geometry import pose_from_vector
 from docking.point_file import read_points
 
@@ -22,6 +24,10 @@ KEYS = {
     "pose", "rms_mm", "max_mm", "used", "rejected", "dropped_readings", "residuals_mm", "refused",
     "method", "covariance", "sigma", "chi2", "dof", "chi2_p", "redundancy", "scale", "swapped",
 }  # fmt: skip
+
+
+def fit_files(nominal: Path, measured: Path, method: str = "ml") -> dict[str, Any]:
+    return fit_json(run_fit(nominal, measured, FitOptions(method=method)))
 
 
 def write(path: Path, names: str, xyz: np.ndarray) -> Path:
