@@ -9,7 +9,16 @@ from typing import Any
 import click
 
 from docking.errors import EXIT_FAULT, EXIT_OK
-from docking.terminal import FILE, Range, json_option, print_json, print_text, transcript_option, wire_choice
+from docking.terminal import (
+    FILE,
+    Range,
+    ask_before,
+    json_option,
+    print_json,
+    print_text,
+    transcript_option,
+    wire_choice,
+)
 
 WIRES = "Addresses that `docking sim` wrote; without it --sim starts its own devices."
 SILENCE = "The drives will miss their controller on purpose. Everything stands, braked, and nothing hangs on a servo?"
@@ -55,7 +64,7 @@ def devices(
     from docking.assemble.commissioning import devices_text, find_devices
 
     if prove_watchdogs and not (sim or yes):
-        click.confirm(SILENCE, abort=True, err=True)
+        ask_before(cell, SILENCE)
     report = find_devices(_request(cell, sim, wires, transcript), prove=prove, watchdogs=prove_watchdogs)
     if as_json:
         print_json(report)

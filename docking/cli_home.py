@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from docking.errors import EXIT_OK
-from docking.terminal import FILE, json_option, print_json, print_text, transcript_option, wire_choice
+from docking.terminal import FILE, ask_before, json_option, print_json, print_text, transcript_option, wire_choice
 
 WARNING = "The axes move by themselves. Nothing rests on {names}, and everybody is clear of them?"
 
@@ -44,7 +44,7 @@ def home(
 
     choice = wire_choice(sim, wires)
     if not (sim or yes):
-        click.confirm(WARNING.format(names=", ".join(positioners) or "any positioner"), abort=True, err=True)
+        ask_before(cell, WARNING.format(names=", ".join(positioners) or "any positioner"))
     look = LookRequest(cell, choice, transcript=transcript)
     report = home_axes(HomeRequest(look, positioners, free))
     if as_json:

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from docking.errors import EXIT_OK
-from docking.terminal import FILE, json_option, print_json, print_text, wire_choice
+from docking.terminal import FILE, ask_before, json_option, print_json, print_text, wire_choice
 
 WARNING = "{name} moves, and goes on when this computer falls silent: it has no watchdog. Everybody clear of it?"
 
@@ -41,7 +41,7 @@ def single(
 
     choice = wire_choice(sim, wires)
     if not (sim or yes):
-        click.confirm(WARNING.format(name=name), abort=True, err=True)
+        ask_before(cell, WARNING.format(name=name))
     report = move_single(LookRequest(cell, choice), name, target_mm, speed)
     if as_json:
         print_json(report)

@@ -68,3 +68,11 @@ def print_json(body: dict[str, Any]) -> None:
     from docking.journal import canonical
 
     print_text(canonical(body))
+
+
+def ask_before(cell: Path, question: str) -> None:
+    """Ask on stderr and end where the answer is no; a CELL file with problems is told before anybody is asked."""
+    from docking.config.load import load_cell
+
+    load_cell(cell)
+    click.confirm(question, abort=True, err=True)

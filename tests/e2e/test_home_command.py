@@ -58,3 +58,15 @@ def test_without_load_cells_somebody_has_to_say_that_nothing_rests_there(tmp_pat
     cell.write_text(text[:cut] + text[end:], "utf-8")
     assert call(["home", str(cell), "--sim"]) == 1
     assert "--free" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "arguments", [["home"], ["single", "platform", "10"], ["devices", "--prove-watchdogs"]], ids=lambda a: a[0]
+)
+def test_a_cell_that_cannot_be_read_is_told_before_anybody_is_asked(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert call([arguments[0], "nowhere.toml", *arguments[1:]]) == 2
+    said = capsys.readouterr()
+    assert "4001" in said.err
+    assert "[y/N]" not in said.err + said.out
