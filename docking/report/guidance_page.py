@@ -46,6 +46,7 @@ def _drawing(result: dict[str, Any]) -> str:
         if mean["paper_mm"] is not None:
             axes.axhline(mean["paper_mm"], color=COLOURS[k], linestyle=DASHES[1], linewidth=1.0)
     axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
     axes.set_xticks(seeds)
     axes.set_xlabel("trajectory")
     axes.set_ylabel("ATE, mm")
