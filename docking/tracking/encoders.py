@@ -1,36 +1,57 @@
 """Gaps bridged by the positioners' encoders: the body's pose by the read-backs, corrected by what the image showed.
 
-For every point and axis a filter with two states, offset `o` (mm) and scale error `s`: p_image - p_encoders = o + s d,
-d the way since the beginning. Both walk slowly: settling, temperature, compliance under changing load.
+What the image shows beyond the read-backs, for a point at `r` from the middle of the points that has gone the way `d`:
+
+    p_image - p_encoders = o + phi x r + diag(s) d + (K d) x r
+
+`o` and `phi` are where the part sits otherwise than the read-backs say, `s` the scale errors of the ways, and `K` the
+turn a way that follows from scales that differ between the positioners. All points share these eighteen states, since
+they are those of one rigid body: the errors of its points are as correlated as the predicted ones. Offsets and scales
+walk slowly: settling, temperature, compliance under changing load.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from docking.errors import BadArgument, DockingError
-from docking.tracking.body import body_pose, described, points_from_pose
+from docking.geometry import skew
+from docking.tracking.body import body_pose, described
 from docking.tracking.faults import Alarms
 from docking.tracking.pointwise import FOR_A_POSE
 from docking.tracking.types import BodyModel, TrackedState
 from docking.types import Array, Pose
 
+_OFFSET, _TURN, _SCALE, _TURN_A_WAY = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 18)
+_STATES = 18
+
 
 @dataclass(frozen=True)
 class EncoderSettings:
     """Noise of a read-back (mm) and the time over which a line is laid through them; sd of offset and scale at the
-    start, and their walks a sqrt(s)."""
+    start, and their walks a sqrt(s). `unlike`: by what share of `scale_sd` the scales of the positioners differ from
+    each other, which turns the body on its way: pitch errors and temperature of like drives are mostly common."""
 
     noise_mm: float = 0.02
     offset_sd_mm: float = 10.0
     scale_sd: float = 0.001
+    unlike: float = 0.2
     offset_walk_mm: float = 0.001
     scale_walk: float = 1e-6
     history_s: float = 2.0
     smooth_s: float = 0.1
+
+
+class _Here(NamedTuple):
+    """The body by the read-backs: points (n, 3), the rotation (3, 3), and variance (mm^2) that all points share."""
+
+    points: Array
+    R: Array
+    common_mm2: float
 
 
 class EncoderTracker:
@@ -41,18 +62,22 @@ class EncoderTracker:
     def __init__(self, body: BodyModel, settings: EncoderSettings | None = None) -> None:
         self.body, self._s = body, settings or EncoderSettings()
         self._index = {name: i for i, name in enumerate(body.names)}
-        n = len(body.names)
         s = self._s
-        self._x = np.zeros((2, n, 3))
-        self._p = np.zeros((3, n, 3))
-        self._p[0], self._p[2] = s.offset_sd_mm**2, s.scale_sd**2
+        off = body.points_B_mm - body.points_B_mm.mean(axis=0)
+        size_mm = max(float(np.sqrt(np.mean(np.sum(off * off, axis=1)))), 1.0)
+        sd = np.repeat([s.offset_sd_mm, s.offset_sd_mm / size_mm, s.scale_sd], 3)
+        differing = s.unlike / size_mm
+        self._p = np.diag(np.concatenate([sd, np.full(9, differing * s.scale_sd)]) ** 2)
+        walk = np.repeat([s.offset_walk_mm, s.offset_walk_mm / size_mm, s.scale_walk], 3)
+        self._walk = np.concatenate([walk, np.full(9, differing * s.scale_walk)]) ** 2
+        self._x = np.zeros(_STATES)
         self._times: list[float] = []
         self._poses: list[Pose] = []
         self._places: list[Array] = []
         self._origin: Array | None = None
         self._frame_s = float("nan")
         self._used_s = float("nan")
-        self._seen = np.zeros(n, dtype=bool)
+        self._seen = np.zeros(len(body.names), dtype=bool)
         self._alarms = Alarms()
         self.dropped = 0
 
@@ -70,9 +95,8 @@ class EncoderTracker:
         if len(self._times) > 512 and self._times[256] < t_s - self._s.history_s:
             del self._times[:256], self._poses[:256], self._places[:256]
 
-    def _encoder_points(self, t_s: float) -> tuple[Array, Array, float] | None:
-        """Points (n, 3) by the read-backs at `t_s`, on a line through those of the last `smooth_s`; the rotation (3, 3)
-        and by how much the line lessens the noise."""
+    def _by_encoders(self, t_s: float) -> _Here | None:
+        """The body at `t_s`, on a line through the read-backs of the last `smooth_s`."""
         last = bisect_right(self._times, t_s)
         if last == 0:
             return None
@@ -86,40 +110,52 @@ class EncoderTracker:
         elif n == 2:
             weights = np.array([0.0, 1.0])
         points = np.tensordot(weights, np.array(self._places[first:last]), 1)
-        return points, self._poses[last - 1].R, float(np.sqrt(weights @ weights))
+        return _Here(points, self._poses[last - 1].R, float(weights @ weights) * self._s.noise_mm**2)
+
+    def _slopes(self, points: Array, about: Array) -> Array:
+        """d(points) / d(states), (k, 3, 18), for points of the body whose middle is at `about`."""
+        assert self._origin is not None
+        way, k = about - self._origin, len(points)
+        H = np.zeros((k, 3, _STATES))
+        H[:, :, _OFFSET], H[:, :, _SCALE] = np.eye(3), np.diag(way)
+        H[:, :, _TURN] = -skew(points - about)
+        H[:, :, _TURN_A_WAY] = (H[:, :, _TURN, None] * way).reshape(k, 3, 9)
+        return H
 
     def points(self, t_s: float, names: tuple[str, ...], xyz_W_mm: Array, cov_mm2: Array) -> None:
         """One frame; see `Tracker.points`. One before the first read-back or out of order is dropped and counted."""
-        found = self._encoder_points(t_s)
-        if found is None or t_s <= self._frame_s:
+        rows = self._rows(names)
+        here = self._by_encoders(t_s)
+        if here is None or t_s <= self._frame_s:
             self.dropped += 1
             return
-        here = found[0]
+        about = here.points.mean(axis=0)
         if self._origin is None:
-            self._origin = here
+            self._origin = about
         if not np.isnan(self._frame_s):
-            dt = t_s - self._frame_s
-            self._p[0] += self._s.offset_walk_mm**2 * dt
-            self._p[2] += self._s.scale_walk**2 * dt
+            self._p = self._p + np.diag(self._walk * (t_s - self._frame_s))
         self._frame_s = t_s
         self._seen = np.zeros(len(self.body.names), dtype=bool)
-        for k, name in enumerate(names):
-            if name not in self._index:
-                raise BadArgument(self.body.name, "no such point", value=name)
-            self._update(self._index[name], here, xyz_W_mm[k], np.diag(cov_mm2[k]))
+        self._seen[rows] = True
+        if rows:
+            H = self._slopes(here.points[rows], about).reshape(-1, _STATES)
+            # what all points share weighs as many times as there are points
+            var = np.diagonal(cov_mm2, axis1=1, axis2=2).ravel() + len(rows) * here.common_mm2
+            self._update(H, (xyz_W_mm - here.points[rows]).ravel(), var)
             self._used_s = t_s
 
-    def _update(self, i: int, here: Array, seen_mm: Array, var: Array) -> None:
-        assert self._origin is not None
-        d = (here - self._origin)[i]
-        oo, os, ss = self._p[:, i]
-        go, gs = oo + d * os, os + d * ss
-        total = go + d * gs + var + self._s.noise_mm**2
-        residual = seen_mm - here[i] - self._x[0, i] - self._x[1, i] * d
-        self._x[0, i] += go / total * residual
-        self._x[1, i] += gs / total * residual
-        self._p[:, i] = oo - go * go / total, os - go * gs / total, ss - gs * gs / total
-        self._seen[i] = True
+    def _rows(self, names: tuple[str, ...]) -> list[int]:
+        for name in names:
+            if name not in self._index:
+                raise BadArgument(self.body.name, "no such point", value=name)
+        return [self._index[name] for name in names]
+
+    def _update(self, H: Array, shown_mm: Array, var: Array) -> None:
+        """Kalman update by the information of the whole frame: P = (P^-1 + H^T R^-1 H)^-1."""
+        weighed = H.T / var
+        p = np.linalg.solve(np.eye(_STATES) + self._p @ weighed @ H, self._p)
+        self._p = 0.5 * (p + p.T)
+        self._x = self._x + self._p @ (weighed @ (shown_mm - H @ self._x))
 
     def alarms(self) -> list[DockingError]:
         """See `Tracker.alarms`."""
@@ -130,32 +166,39 @@ class EncoderTracker:
         if self._origin is None or np.isnan(self._used_s):
             return None
         t = max(self._times[-1], self._frame_s) if t_s is None else t_s
-        found = self._encoder_points(t)
-        assert found is not None
-        here, R, less = found
-        d = here - self._origin
-        oo, os, ss = self._p
-        points = here + self._x[0] + self._x[1] * d
-        var = oo + 2.0 * d * os + d * d * ss + self._s.offset_walk_mm**2 * (t - self._frame_s)
-        cov = var[:, :, None] * np.eye(3)
-        return self._described(t, points, cov, R, (less * self._s.noise_mm) ** 2)
-
-    def _described(self, t_s: float, points: Array, cov: Array, R: Array, common_mm2: float) -> TrackedState:
-        """`common_mm2`: variance that all points share, the noise of the read-backs."""
+        here = self._by_encoders(t)
+        assert here is not None
+        about = here.points.mean(axis=0)
+        H = self._slopes(here.points, about)
+        ahead = self._p + np.diag(self._walk * max(t - self._frame_s, 0.0))
+        common = here.common_mm2 * np.eye(3)
+        cov = H @ ahead @ H.transpose(0, 2, 1) + common
+        points = here.points + H @ self._x
         if len(points) >= FOR_A_POSE:
-            pose = body_pose(self.body, points, cov)
-            points, cov = points_from_pose(self.body, pose)  # a rigid body: every point has the others' readings too
+            fitted = body_pose(self.body, points, np.tile(np.eye(3), (len(points), 1, 1)))
+            points, X = fitted.X_WB.apply(self.body.points_B_mm), fitted.X_WB
         else:
-            X = Pose(R, (points - self.body.points_B_mm @ R.T).mean(axis=0))
-            six = np.full((6, 6), np.nan)
-            six[3:, 3:] = cov.mean(axis=0) / len(cov)
-            pose = described(X, X.apply(self.body.com_B_mm), six)
-        six = pose.cov.copy()
-        six[3:, 3:] += common_mm2 * np.eye(3)
-        cov = cov + common_mm2 * np.eye(3)
+            X = Pose(here.R, (points - self.body.points_B_mm @ here.R.T).mean(axis=0))
+        return self._described(t, X, points, cov, self._body_cov(X, about, ahead, common))
+
+    def _body_cov(self, X: Pose, about: Array, p: Array, common: Array) -> Array:
+        """(6, 6) of turn and place of the centre of mass; NaN in the turn where fewer than three points show it."""
+        com = X.apply(self.body.com_B_mm)[None]
+        jac = np.concatenate([np.zeros((3, _STATES)), self._slopes(com, about)[0]])
+        way = about - self._origin if self._origin is not None else np.zeros(3)
+        jac[:3, _TURN] = np.eye(3)
+        jac[:3, _TURN_A_WAY] = (np.eye(3)[:, :, None] * way).reshape(3, 9)
+        six = jac @ p @ jac.T
+        six[3:, 3:] += common
+        if len(self.body.names) < FOR_A_POSE:
+            six[:3], six[:, :3] = np.nan, np.nan
+        return np.asarray(six)
+
+    def _described(self, t_s: float, X: Pose, points: Array, cov: Array, six: Array) -> TrackedState:
+        pose = described(X, X.apply(self.body.com_B_mm), six)
         source = "image" if self._seen.any() else "encoders"
         worst = float(np.sqrt(np.trace(cov, axis1=1, axis2=2).max()))
         return TrackedState(
-            t_s, pose.X_WB, np.full(3, np.nan), six, pose.com_W_mm, points, cov, self._seen, pose.attitude_rad,
+            t_s, pose.X_WB, np.full(3, np.nan), pose.cov, pose.com_W_mm, points, cov, self._seen, pose.attitude_rad,
             pose.attitude_sd_rad, t_s - self._used_s, source, worst,
         )  # fmt: skip
