@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from docking.tracking.recording import Recording
+from docking.tracking.repaired import tilt_growth_mm
 from docking.tracking.replay import first_known, start_of
 from docking.tracking.types import MM_PER_M, InertialModel
 from docking.types import Array
@@ -91,10 +92,10 @@ def predicted_sd_mm(model: InertialModel, gap_s: float) -> tuple[float, float]:
     """3-D sd (mm) after a gap of the decoupled and of the coupled form, once both have settled.
 
     Both carry white force noise, Na sqrt(t^3/3), and the white rate noise through gravity, g Ng sqrt(t^5/20). The
-    coupled form has the rate bias from the image; for the decoupled one it runs on freely, g b t^3/6.
+    coupled form has the rate bias from the image; for the decoupled one tilt grows with it, 0.5 g theta t^2.
     """
     t, g = gap_s, 9.80665
     white = 3.0 * model.force_density**2 * t**3 / 3.0 + 2.0 * (g * model.rate_density) ** 2 * t**5 / 20.0
     walk = 3.0 * model.force_walk**2 * t**5 / 20.0
-    free = 2.0 * (g * model.rate_bias * t**3 / 6.0) ** 2
+    free = 2.0 * (tilt_growth_mm(model.rate_bias, t) / MM_PER_M) ** 2
     return MM_PER_M * float(np.sqrt(white + walk + free)), MM_PER_M * float(np.sqrt(white + walk))

@@ -47,18 +47,19 @@ class Alarms:
     """Alarms waiting to be taken; a fault that stands is told once."""
 
     def __init__(self) -> None:
-        self._standing: set[type[DockingError]] = set()
+        self._standing: set[tuple[type[DockingError], str]] = set()
         self._waiting: list[DockingError] = []
 
     def raise_(self, error: DockingError) -> None:
-        """Keep the alarm unless one of its kind stands."""
-        if type(error) not in self._standing:
-            self._standing.add(type(error))
+        """Keep the alarm unless one of its kind stands for the same source."""
+        key = type(error), error.where
+        if key not in self._standing:
+            self._standing.add(key)
             self._waiting.append(error)
 
-    def gone(self, kind: type[DockingError]) -> None:
-        """The fault is over: it would be told again."""
-        self._standing.discard(kind)
+    def gone(self, kind: type[DockingError], where: str) -> None:
+        """The fault of that source is over: it would be told again."""
+        self._standing.discard((kind, where))
 
     def taken(self) -> list[DockingError]:
         """All waiting alarms; afterwards none waits."""
@@ -90,7 +91,7 @@ class InertialWatch:
         self._same = self._same + 1 if same else 0
         if self._same < self._s.same_samples:
             if not same:
-                self._alarms.gone(SensorFrozen)
+                self._alarms.gone(SensorFrozen, self._where)
             return True
         self._alarms.raise_(SensorFrozen(self._where, value=self._same, limit=self._s.same_samples))
         return False
@@ -101,7 +102,7 @@ class InertialWatch:
             self._alarms.raise_(TimeJumped(self._where, value=step_s, limit=limit))
             return False
         self._usual_s = step_s if self._usual_s == 0.0 else 0.99 * self._usual_s + 0.01 * step_s
-        self._alarms.gone(TimeJumped)
+        self._alarms.gone(TimeJumped, self._where)
         return True
 
     def _in_range(self, force: list[float], rate: list[float]) -> bool:
@@ -112,7 +113,7 @@ class InertialWatch:
         if not (w < self._rate_limit):
             self._alarms.raise_(SensorSaturated(self._where, value=w, limit=self._model.rate_range))
             return False
-        self._alarms.gone(SensorSaturated)
+        self._alarms.gone(SensorSaturated, self._where)
         return True
 
 
@@ -132,7 +133,7 @@ class FrameWatch:
     """Judges a frame's residuals: what lies behind points that were refused."""
 
     def __init__(self, body: BodyModel, settings: WatchSettings, alarms: Alarms) -> None:
-        self._body, self._s, self._alarms = body, settings, alarms
+        self._body, self._s, self._alarms, self._where = body, settings, alarms, f"{body.name} points"
         self._refused, self._since = 0, _NEVER_S
         self._same, self._before = 0, np.zeros(0)
 
@@ -143,16 +144,16 @@ class FrameWatch:
         self._same = self._same + 1 if same and not resting else 0
         if self._same < self._s.same_frames:
             if not same:
-                self._alarms.gone(SensorFrozen)
+                self._alarms.gone(SensorFrozen, self._where)
             return False
-        self._alarms.raise_(SensorFrozen(f"{self._body.name} points", value=self._same, limit=self._s.same_frames))
+        self._alarms.raise_(SensorFrozen(self._where, value=self._same, limit=self._s.same_frames))
         return True
 
     def used(self) -> None:
         """A frame agreed: whatever was wrong has gone."""
         self._refused, self._since = 0, _NEVER_S
         for kind in (ReferenceShifted, TrackingLost):
-            self._alarms.gone(kind)
+            self._alarms.gone(kind, self._body.name)
 
     def tell_swapped(self, names: tuple[str, ...], pairs: list[tuple[int, int]]) -> None:
         """Raise or clear the alarm of swapped points."""
@@ -160,7 +161,7 @@ class FrameWatch:
             cause = ", ".join(f"{names[i]} with {names[j]}" for i, j in pairs)
             self._alarms.raise_(PointsSwapped(self._body.name, cause))
         else:
-            self._alarms.gone(PointsSwapped)
+            self._alarms.gone(PointsSwapped, self._body.name)
 
     def refused(self, t_s: float, residuals_mm: Array, good: NDArray[np.bool_], sd_mm: float) -> bool:
         """Count a frame of which nothing was used; True when tracking has to begin anew."""

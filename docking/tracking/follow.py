@@ -110,7 +110,9 @@ def make_tracker(recording: Recording, method: str, settings: FollowSettings, ti
     if method == "repaired":
         return RepairedTracker(body, model, start)
     rest = ZeroVelocity() if settings.rest else None
-    chosen = InertialSettings(extras=settings.extras, zero_velocity=rest, lever_limit_mm=float("inf"))
+    chosen = InertialSettings(extras=settings.extras, zero_velocity=rest)
+    if not body.points_B_mm.any():  # one point without nominal place: nobody has stated a lever arm
+        chosen = replace(chosen, lever_limit_mm=float("inf"))
     return InertialTracker(body, model, start, chosen, Tape() if method == "ins-smoothed" else None)
 
 

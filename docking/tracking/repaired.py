@@ -11,11 +11,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from docking.geometry import log_so3
 from docking.tracking.axis_filters import ThreeStateFilters, drift_noise
-from docking.tracking.pointwise import Frame, PointwiseTracker
+from docking.tracking.pointwise import FOR_A_POSE, SHOWN_TILT_RAD, Frame, PointwiseTracker
 from docking.tracking.strapdown import Integral
 from docking.tracking.types import GRAVITY_W_MM_S2, MM_PER_M, BodyModel, InertialModel, Start
 from docking.types import Array
+
+LAG_S = 2.0
+"""By so much the bias state follows a growing tilt late."""
+
+
+def tilt_growth_mm(rate_sd_rad_s: float, t_s: float) -> float:
+    """Horizontal error after `t_s` without image: 0.5 g theta t^2 with the tilt that the bias state has missed, the
+    lag, and the mean of what comes in the gap, t / 3."""
+    g = float(np.linalg.norm(GRAVITY_W_MM_S2))
+    return 0.5 * g * rate_sd_rad_s * (LAG_S + t_s / 3.0) * t_s * t_s
 
 
 @dataclass(frozen=True)
@@ -72,6 +83,19 @@ class RepairedTracker(PointwiseTracker):
         dp, dv, db = self._errors.x.reshape(3, -1, 3)
         self._p_mm, self._v_mm_s, self._b_mm_s2 = self._p_mm - dp, self._v_mm_s - dv, self._b_mm_s2 + db
         self._errors.x = np.zeros_like(self._errors.x)
+
+    def _unmodelled_mm2(self, lost: Integral, ins: Integral) -> Array:
+        """Tilt goes on growing at the rate bias, 0.5 g theta t^2, from a bias state that lags it; the force bias turns
+        with the body while its state stands still in W; and a wrong heading turns what the motion itself gives."""
+        t = ins.t_s - lost.t_s
+        tilt = tilt_growth_mm(self._rate_sd(ins.t_s), t)
+        if len(self.body.names) >= FOR_A_POSE:
+            tilt = float(np.hypot(tilt, 0.5 * 9806.65 * SHOWN_TILT_RAD * t * t))
+        turned = 0.5 * float(np.linalg.norm(log_so3(ins.C_WI @ lost.C_WI.T)))
+        bias = 0.5 * t * t * self._model.force_bias * MM_PER_M * turned
+        way = ins.s_mm - lost.s_mm - lost.v_mm_s * t
+        aside = self._heading_sd() * float(np.hypot(way[0], way[1]))
+        return np.array([np.hypot(tilt, aside)] * 2 + [0.0]) ** 2 + bias * bias
 
     def _points_at(self, t_s: float, ins: Integral) -> tuple[Array, Array, Array]:
         points, velocity, _ = self._carried(ins)

@@ -141,3 +141,13 @@ def test_one_point_and_no_attitude_is_refused() -> None:
         tracker.points(0.0, ("P",), np.zeros((1, 3)), np.eye(3)[None])
     with pytest.raises(BadArgument):
         tracker.points(0.0, ("Q",), np.zeros((1, 3)), np.eye(3)[None])
+
+
+def test_a_fault_that_stands_is_told_once_whatever_other_sources_do() -> None:
+    """A moving camera says nothing about a frozen inertial sensor."""
+    recording, _, _ = record(BODY, LENGTH_S)
+    force, rate = recording.force_m_s2.copy(), recording.rate_rad_s.copy()
+    stuck = recording.imu_t_s > 4.0
+    force[stuck], rate[stuck] = force[np.argmax(stuck)], rate[np.argmax(stuck)]
+    alarms, _ = run(replace(recording, force_m_s2=force, rate_rad_s=rate))
+    assert [type(alarm) for alarm in alarms].count(SensorFrozen) == 1
