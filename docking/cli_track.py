@@ -129,20 +129,29 @@ def _refuse_without_live(options: dict[str, object]) -> None:
     "--runs", type=click.IntRange(min=1), default=24, show_default=True, help="Runs of four gaps for a grade."
 )
 @click.option("--workers", type=click.IntRange(min=1), help="Processes (default: one a core).")
+@click.option("--report", type=FILE, help="Write distributions and table to this HTML file.")
 @json_option
-def study_tracking(runs: int, workers: int | None, as_json: bool) -> int:
+def study_tracking(runs: int, workers: int | None, report: Path | None, as_json: bool) -> int:
     """Simulate moving bodies and see what every method makes of gaps of 3 s, for four grades of inertial sensor.
 
     Says where the published claim (1 to 2 cm kept through 3 s) holds. Exits with 1 when a bar is missed.
 
     \b
-    Example: docking study tracking --runs 24
+    Example: docking study tracking --runs 24 --report tracking.html
     """
     from docking.study_tracking import study_text, study_tracking
 
     if workers is not None and not workers >= 1:
         raise BadArgument("--workers", "at least one is needed", value=workers, limit=1)
+    if report is not None:
+        from docking.report.sheet import check_drawing
+
+        check_drawing()
     result = study_tracking(runs, workers, lambda text: print_text(text, err=as_json))
+    if report is not None:
+        from docking.report.tracking_study_page import write_tracking_study_page
+
+        write_tracking_study_page(result, report)
     if as_json:
         print_json(result)
     else:
