@@ -13,6 +13,9 @@ from docking.tracking.grades import GRADES
 from docking.tracking.recording import Gap, Recording
 from docking.tracking.replay import every
 
+END_S = 0.1
+"""By so much a gap may end after the last frame: nobody counts frames."""
+
 
 def run_track(files: Sequence[Path], options: Mapping[str, object]) -> Followed:
     """Read, hide, follow. Raises FileUnreadable, BadRecording, BadArgument and what the trackers raise."""
@@ -45,8 +48,9 @@ def gaps_of(recording: Recording, options: Mapping[str, object]) -> list[Gap]:
         gaps += every(recording, period, length)
     whole = float(recording.frame_t_s[-1]) - recording.begin_s
     for gap in gaps:
-        if not (gap.start_s < whole):
-            raise BadArgument("--occlude", "the recording ends before", value=gap.start_s, limit=whole)
+        end = gap.start_s + gap.length_s
+        if not (end <= whole + END_S):
+            raise BadArgument("--occlude", "the recording ends before the gap does", value=end, limit=whole)
     gaps.sort()
     for a, b in pairwise(gaps):
         if not (a.start_s + a.length_s <= b.start_s):

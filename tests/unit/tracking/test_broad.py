@@ -73,7 +73,7 @@ def independent(recording: Recording) -> float:
 @pytest.mark.parametrize(
     ("name", "length_s"),
     [
-        (TRANSLATION, 82.0),
+        (TRANSLATION, 62.0),
         *(pytest.param(n, 1e9, marks=pytest.mark.full) for n in (TRANSLATION, ROTATION, TAPPING)),
     ],
 )
