@@ -21,6 +21,8 @@ _LABEL_MM = 4.0
 _MOST_MARKERS = 1000
 _KAPPA = 0.5522847498307936
 """Control arm of the cubic that is nearest to a quarter of a unit circle."""
+_CRISP = 'shape-rendering="crispEdges"'
+"""Cells side by side without a grey seam between them."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +174,8 @@ def svg(shapes: list[Shape], page_mm: tuple[float, float]) -> str:
         match shape:
             case Rectangle(x, y, w, h, black):
                 colour = "black" if black else "white"
-                lines.append(f'<rect x="{x:.6g}" y="{y:.6g}" width="{w:.6g}" height="{h:.6g}" fill="{colour}"/>')
+                size = f'width="{w:.6g}" height="{h:.6g}"'
+                lines.append(f'<rect x="{x:.6g}" y="{y:.6g}" {size} fill="{colour}" {_CRISP}/>')
             case Disc(x, y, radius):
                 lines.append(f'<circle cx="{x:.6g}" cy="{y:.6g}" r="{radius:.6g}" fill="black"/>')
             case Label(x, y, text):
