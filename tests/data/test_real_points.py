@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from docking.fit_report import fit_files
+from docking.fit_options import FitOptions
+from docking.fit_report import fit_json, run_fit
 from tests.support.shared_data import shared_data
 
 DATA = shared_data()
@@ -34,7 +35,7 @@ def barrel(tmp_path: Path) -> tuple[Path, Path]:
 def test_surveyed_barrel(barrel: tuple[Path, Path], method: str, rms_mm: float) -> None:
     """Deviations of 0.1-0.7 mm are how the part was built, not wrong points: all 198 are used."""
     start = time.perf_counter()
-    result = fit_files(*barrel, method)
+    result = fit_json(run_fit(*barrel, FitOptions(method=method)))
     seconds = time.perf_counter() - start
     assert result["refused"] is None
     assert len(result["used"]) == 198
@@ -53,7 +54,7 @@ def test_barrel_with_gross_errors_loses_only_those(barrel: tuple[Path, Path]) ->
         wrong = np.array(xyz, dtype=float) + rng.choice([-1.0, 1.0], 3) * rng.uniform(4.0, 20.0, 3)
         lines[row], bad[name] = ",".join([name, *map(str, wrong)]), "mis-aimed"
     barrel[1].write_text("\n".join(lines))
-    result = fit_files(*barrel)
+    result = fit_json(run_fit(*barrel))
     assert {r["name"]: r["reason"] for r in result["rejected"]} == bad
 
 
@@ -87,7 +88,7 @@ def test_every_epoch_of_the_base(epochs: Epochs) -> None:
     lost = {115, 133, 134, 143, 178}
     assert set(np.flatnonzero(~epochs.clean)) == lost | {21, 50, 135}
     for k in range(200):
-        result = fit_files(nominal, epochs.epoch(BASE, k))
+        result = fit_json(run_fit(nominal, epochs.epoch(BASE, k)))
         if epochs.clean[k]:
             assert result["used"] == list(BASE)
             assert result["rms_mm"] < 0.012
@@ -99,7 +100,7 @@ def test_every_epoch_of_the_base(epochs: Epochs) -> None:
 
 def test_base_in_two_hundred_passes(epochs: Epochs) -> None:
     rows = [(n, epochs.xyz[n][k]) for k in range(200) for n in BASE]
-    result = fit_files(epochs.nominal(BASE), write(epochs.folder / "passes.csv", rows))
+    result = fit_json(run_fit(epochs.nominal(BASE), write(epochs.folder / "passes.csv", rows)))
     assert result["used"] == list(BASE)
     assert result["rms_mm"] < 0.005
     reasons = [(r["name"], r["reason"]) for r in result["dropped_readings"]]
@@ -109,7 +110,7 @@ def test_base_in_two_hundred_passes(epochs: Epochs) -> None:
 def test_every_epoch_of_the_tool(epochs: Epochs) -> None:
     """The tool moves, its figure does not: one epoch serves as nominal of all the others."""
     nominal = write(epochs.folder / "tool.csv", [(n, epochs.xyz[n][0]) for n in TOOL])
-    rms = [fit_files(nominal, epochs.epoch(TOOL, k))["rms_mm"] for k in range(200)]
+    rms = [fit_json(run_fit(nominal, epochs.epoch(TOOL, k)))["rms_mm"] for k in range(200)]
     assert max(rms) < 0.03
     assert np.median(rms) < 0.005
 
@@ -119,7 +120,7 @@ def test_base_and_tool_together(epochs: Epochs) -> None:
     nominal = epochs.nominal(BASE + TOOL)
     used = 0
     for k in range(0, 200, 4):
-        result = fit_files(nominal, epochs.epoch(BASE + TOOL, k))
+        result = fit_json(run_fit(nominal, epochs.epoch(BASE + TOOL, k)))
         assert result["used"] in ([], list(BASE))
         used += bool(result["used"])
     assert used >= 45
@@ -127,7 +128,7 @@ def test_base_and_tool_together(epochs: Epochs) -> None:
 
 def test_two_rigid_bodies_are_ambiguous(epochs: Epochs) -> None:
     nominal = write(epochs.folder / "six.csv", [(n, epochs.xyz[n][0]) for n in BASE + TOOL])
-    assert "more than one set" in fit_files(nominal, epochs.epoch(BASE + TOOL, 7))["refused"]
+    assert "more than one set" in fit_json(run_fit(nominal, epochs.epoch(BASE + TOOL, 7)))["refused"]
 
 
 def test_twenty_survey_points_against_another_program(tmp_path: Path) -> None:
@@ -138,7 +139,7 @@ def test_twenty_survey_points_against_another_program(tmp_path: Path) -> None:
     paths = [
         write(tmp_path / f"{k}.csv", list(zip(names, xyz, strict=True))) for k, xyz in (("n", source), ("m", target))
     ]
-    result = fit_files(*paths)
+    result = fit_json(run_fit(*paths))
     assert result["used"] == names
     printed = np.loadtxt(folder / "SK-42-SK-95-param-1.0.5.txt", max_rows=3)
     assert np.allclose(np.array(result["pose"]["matrix"])[:3, :3], printed, atol=1e-9)
