@@ -171,7 +171,7 @@ class RemoteMotion:
     # in ------------------------------------------------------------------------------------------------------------
     def _take(self, message: bytes) -> None:
         kind, number, payload = decode(message)
-        self._heard_s = self._loop.time()
+        self._heard(kind)
         if kind == "still":
             if self._feedback is not None:
                 self._feedback = replace(self._feedback, t_s=payload)
@@ -192,6 +192,11 @@ class RemoteMotion:
             if kind == "lateness":
                 self.speed_limit_mm_s = payload["speed_limit_mm_s"]
             self._tell(kind, payload)
+
+    def _heard(self, kind: str) -> None:
+        """After its greeting the other side reads files and is silent as long as that takes: START_S bounds it."""
+        if kind != "hello":
+            self._heard_s = self._loop.time()
 
     def _answered(self, kind: str, number: int, payload: Any) -> None:
         answer = self._waiting.get(number)

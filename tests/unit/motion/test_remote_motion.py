@@ -21,6 +21,7 @@ from docking.errors import (
 from docking.motion import StreamedMotion
 from docking.motion.channel import QueueChannel
 from docking.motion.lateness import LATENESS, Lateness, measure_lateness, speed_limit_mm_s
+from docking.motion.messages import encode
 from docking.motion.remote import LeaseSettings, RemoteMotion
 from docking.motion.served import ServedMotion, ServiceSettings
 from sim.virtual_time import run_virtual
@@ -327,3 +328,26 @@ def test_how_late_the_cycles_of_a_run_came_is_told_at_its_end():
 async def scenario_without(bench: Bench) -> None:
     assert (await (await bench.moving())).result == "done"
     await bench.motion.close()
+
+
+def test_a_process_that_reads_its_files_after_its_greeting_is_waited_for() -> None:
+    """Nothing may be taken for its death before it has begun to work; afterwards the lease's time counts."""
+
+    async def main() -> tuple[float, float]:
+        loop = asyncio.get_running_loop()
+        near, far = QueueChannel.pair(loop)
+        motion = RemoteMotion(near, SITE.positioners.axes, LeaseSettings(LEASE_S, 0.1), lambda what, body: None)
+        begun_s = loop.time()
+        waiting = loop.create_task(motion.connect())
+        far.send(encode("hello", 0, {"pid": 1, "priority": True}))
+        await asyncio.sleep(5.0)
+        assert not waiting.done()
+        far.send(encode("alive", 0))
+        spoke_s = loop.time()
+        with pytest.raises(MotionProcessLost, match="silent"):
+            await waiting
+        return spoke_s - begun_s, loop.time() - spoke_s
+
+    waited_s, silent_s = run_virtual(main)
+    assert waited_s == pytest.approx(5.0, abs=0.1)
+    assert LEASE_S <= silent_s <= 2.0 * LEASE_S
