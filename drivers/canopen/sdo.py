@@ -45,6 +45,11 @@ class SdoClient:
         """Take a frame of the node's SDO answer channel."""
         reply = codec.parse_sdo(data)
         wanted = self._answer
+        if wanted is not None and wanted.cancelled() and self._late is None:
+            # Given up in this very turn of the loop: the answer is here before whoever asked has heard.
+            self._late = asyncio.Event()
+            self._late.set()
+            return
         if wanted is None or wanted.done() or (reply.address is not None and reply.address != self._expected):
             if self._late is not None and not self._late.is_set():
                 # The answer to a request that was given up: no second device.
@@ -123,7 +128,7 @@ class SdoClient:
             self._abort(entry, _ABORT_TIMEOUT)
             raise DeviceSilent(self.where, f"node {self.node}, object {entry.label}", limit=self.deadline_s) from error
         except asyncio.CancelledError:
-            self._late = asyncio.Event()
+            self._late = self._late or asyncio.Event()
             raise
         finally:
             self._answer = None

@@ -1,5 +1,7 @@
 """The SDO client against a real server object, with late, foreign and missing answers."""
 
+import asyncio
+
 import pytest
 
 from docking.errors import BadReply, DeviceRefused, DeviceSilent
@@ -141,5 +143,28 @@ def test_wrong_length_and_toggle() -> None:
         wire.twist = lambda answer: bytes((answer[0] | 0x10,)) + answer[1:] if answer[0] < 0x20 else answer
         with pytest.raises(BadReply, match="toggle"):
             await wire.client.read_bytes(MAP.objects["device_name"])
+
+    run_virtual(main)
+
+
+@pytest.mark.parametrize("turns", [0, 1, 3], ids=["in the same turn", "one turn later", "three turns later"])
+def test_the_answer_to_a_request_that_was_given_up_is_no_second_device(turns: int) -> None:
+    async def main() -> None:
+        wire = Wire()
+        wire.twist = lambda answer: None
+        task = asyncio.ensure_future(wire.client.read(MAP.objects["serial"]))
+        await asyncio.sleep(0.001)
+        task.cancel()
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        answer = wire.server.answer(wire.sent[-1][1])
+        assert answer is not None
+        wire.client.on_reply(answer)
+        await asyncio.gather(task, return_exceptions=True)
+        wire.twist = lambda answer: answer
+        assert await wire.client.read(MAP.objects["serial"]) == 402_005
+        assert wire.client.stray == 0
+        wire.client.on_reply(answer)
+        assert wire.client.stray == 1
 
     run_virtual(main)
