@@ -2,16 +2,19 @@
 
 What needs no attitude is compared: the length of the specific force with that of the image's acceleration minus
 gravity, both smoothed alike: the image's way by a local parabola, the force by what that parabola does to a second
-derivative. The lag with the best correlation wins, between steps by a parabola.
+derivative. Where the image shows attitudes, the turning between frames is compared with the gyroscope's, too. The lag
+with the best correlation wins, between steps by a parabola.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import savgol_coeffs
+from scipy.spatial.transform import Rotation
 
 from docking.pose.batch import fit_poses
 from docking.pose.layout import MIN_POINTS
@@ -24,6 +27,7 @@ _RATE_HZ = 200.0
 _WINDOW_S = 0.25
 _LEAST_CORRELATION = 0.5
 _LEAST_S = 5.0
+_STRIDE_S = 0.1
 
 
 class TimeOffset(NamedTuple):
@@ -34,19 +38,87 @@ class TimeOffset(NamedTuple):
     correlation: float
 
 
+Score = Callable[[float], float]
+"""Correlation of what image and sensor say, for a lag in s; NaN where too little is known."""
+
+
 def find_time_offset(recording: Recording, reach_s: float = 0.3) -> TimeOffset:
-    """The lag within +-`reach_s`. Raises DegenerateTargets where three points or more lie on a line."""
+    """The lag within +-`reach_s`, by force or by turning, whichever shows it more sharply.
+
+    Raises DegenerateTargets where three points or more lie on a line.
+    """
+    peaks = [_peak(score, reach_s) for score in (_force_score(recording), _turning_score(recording))]
+    return max(peaks, key=lambda peak: peak[1])[0]
+
+
+def _peak(score: Score, reach_s: float) -> tuple[TimeOffset, float]:
+    """The best lag and how sharp it stands out (bend of the correlation over its lack to 1; -1: it does not)."""
+    lags = np.arange(-int(reach_s * _RATE_HZ), int(reach_s * _RATE_HZ) + 1)
+    found = np.array([score(lag / _RATE_HZ) for lag in lags])
+    if np.isnan(found).all():
+        return TimeOffset(0.0, float("nan")), -1.0
+    best = int(np.nanargmax(found))
+    if not (found[best] >= _LEAST_CORRELATION) or best in (0, len(lags) - 1):
+        return TimeOffset(0.0, float(found[best])), -1.0
+    a, b, c = found[best - 1 : best + 2]
+    bend = 2.0 * b - a - c
+    if not (bend > 0.0):
+        return TimeOffset(0.0, float(b)), -1.0
+    late_s = float((lags[best] + 0.5 * (c - a) / bend) / _RATE_HZ)
+    return TimeOffset(late_s, float(b)), float(bend / max(1.0 - b, 1e-9))
+
+
+def _force_score(recording: Recording) -> Score:
     grid, image, known = _image_force(recording)
     if known.sum() < _LEAST_S * _RATE_HZ:
-        return TimeOffset(0.0, float("nan"))
-    lags = np.arange(-int(reach_s * _RATE_HZ), int(reach_s * _RATE_HZ) + 1)
-    score = np.array([_correlation(recording, grid, image, known, lag / _RATE_HZ) for lag in lags])
-    best = int(np.nanargmax(score))
-    if not (score[best] >= _LEAST_CORRELATION) or best in (0, len(lags) - 1):
-        return TimeOffset(0.0, float(score[best]))
-    a, b, c = score[best - 1 : best + 2]
-    part = 0.5 * (a - c) / (a - 2.0 * b + c)
-    return TimeOffset(float((lags[best] + part) / _RATE_HZ), float(b))
+        return lambda late_s: float("nan")
+    return lambda late_s: _correlation(recording, grid, image, known, late_s)
+
+
+def _turning_score(recording: Recording) -> Score:
+    """Length of the mean turning rate between frames `_STRIDE_S` apart: the image's against the gyroscope's."""
+    R, t, imu_t = _image_attitudes(recording), recording.frame_t_s, recording.imu_t_s
+    if len(t) < 2 or len(imu_t) < 2:
+        return lambda late_s: float("nan")
+    step = max(1, round(_STRIDE_S / float(np.median(np.diff(t)))))
+    known = np.asarray(np.isfinite(R).all(axis=(1, 2)))
+    pair = known[step:] & known[:-step] & (t[step:] - t[:-step] < 1.5 * _STRIDE_S)
+    first, last = t[:-step][pair], t[step:][pair]
+    if (last - first).sum() < _LEAST_S * step:
+        return lambda late_s: float("nan")
+    turn = np.swapaxes(R[:-step][pair], 1, 2) @ R[step:][pair]
+    image = Rotation.from_matrix(turn).magnitude() / (last - first)
+    steps = 0.5 * (recording.rate_rad_s[1:] + recording.rate_rad_s[:-1]) * np.diff(imu_t)[:, None]
+    turned = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+
+    def score(late_s: float) -> float:
+        ends = (
+            np.column_stack([np.interp(at + late_s, imu_t, turned[:, k]) for k in range(3)]) for at in (first, last)
+        )
+        begun, ended = ends
+        use = (first + late_s > imu_t[0]) & (last + late_s < imu_t[-1])
+        rate = np.linalg.norm(ended - begun, axis=1) / (last - first)
+        return _correlated(image[use], rate[use])
+
+    return score
+
+
+def _image_attitudes(recording: Recording) -> Array:
+    """(M, 3, 3) as recorded, else by the pose of three points or more; NaN where the image shows none."""
+    if np.isfinite(recording.attitude_WB).any():
+        return recording.attitude_WB
+    whole = np.asarray(recording.seen().all(axis=1))
+    result = np.full((len(whole), 3, 3), np.nan)
+    if len(recording.body.names) >= MIN_POINTS and whole.any():
+        result[whole] = fit_poses(recording.body.points_B_mm, recording.points_W_mm[whole]).R
+    return result
+
+
+def _correlated(a: Array, b: Array) -> float:
+    if len(a) < 2:
+        return float("nan")
+    a, b = a - a.mean(), b - b.mean()
+    return float(a @ b) / max(float(np.sqrt((a @ a) * (b @ b))), 1e-12)
 
 
 def _image_force(recording: Recording) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -95,8 +167,7 @@ def _correlation(recording: Recording, grid: Array, image: Array, known: NDArray
     use = known & (grid > t[0] + _WINDOW_S) & (grid < t[-1] - _WINDOW_S)
     if use.sum() < _LEAST_S * _RATE_HZ:
         return float("nan")
-    a, b = image[use] - image[use].mean(), smooth[use] - smooth[use].mean()
-    return float(a @ b / max(np.sqrt((a @ a) * (b @ b)), 1e-12))
+    return _correlated(image[use], smooth[use])
 
 
 def _double_integral_weights() -> Array:

@@ -97,10 +97,12 @@ def test_many_points_show_attitude_and_bridge_a_gap_without_a_stated_start() -> 
 def test_a_late_sensor_is_found_before_and_in_the_filter() -> None:
     for late in (0.007, -0.06):
         recording, _, _ = record(POINT, 14.0, "mems", 5, late_s=late, imu_hz=285.7, frame_hz=47.6)
-        assert find_time_offset(recording).late_s == pytest.approx(late, abs=0.001)
+        unknown = np.full_like(recording.attitude_WB, np.nan)
+        assert find_time_offset(recording).late_s == pytest.approx(late, abs=0.0003)
         answer = follow(recording, [], FollowSettings("ins", GRADES["mems"]))
         assert answer.time_offset_s == pytest.approx(late, abs=0.0007)
-    still = replace(recording, points_W_mm=recording.points_W_mm[:1] + 0.0 * recording.points_W_mm)
+    assert find_time_offset(replace(recording, attitude_WB=unknown)).late_s == pytest.approx(late, abs=0.001)
+    still = replace(recording, points_W_mm=recording.points_W_mm[:1] + 0.0 * recording.points_W_mm, attitude_WB=unknown)
     assert find_time_offset(still).late_s == 0.0
 
 
