@@ -59,7 +59,7 @@ def track(files: tuple[Path, ...], plot: Path | None, live: bool, as_json: bool,
     """
     if live:
         return _live(files, options, as_json)
-    _refuse_without_live(options)
+    _refuse_without_live(files, options)
     from docking.recordings import nominal_files
     from docking.track_report import run_track, track_text
 
@@ -117,8 +117,10 @@ def _live(files: tuple[Path, ...], options: dict[str, object], as_json: bool) ->
     return EXIT_OK
 
 
-def _refuse_without_live(options: dict[str, object]) -> None:
-    """Options of --live would be taken and have no effect."""
+def _refuse_without_live(files: tuple[Path, ...], options: dict[str, object]) -> None:
+    """Options of --live would be taken and have no effect; a TOML file alone is no recording."""
+    if len(files) == 1 and files[0].suffix == ".toml":
+        raise BadArgument(str(files[0]), "the part of a CELL is followed with --live", value="no recording")
     for name in ("seconds", "sim", "wires"):
         if options.pop(name):
             raise BadArgument(f"--{name}", "belongs to --live")

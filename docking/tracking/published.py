@@ -26,10 +26,8 @@ class PublishedSettings:
     acceleration_sd_mm_s2: float = 2000.0
 
 
-class PublishedTracker(PointwiseTracker):
-    """Decoupled: filter 1 (bias, order 0) and filter 2 (position, order 2) for every point and axis."""
-
-    method = "published"
+class _PrintedTracker(PointwiseTracker):
+    """What both printed forms share: the settings of their motion model."""
 
     def __init__(
         self,
@@ -40,12 +38,18 @@ class PublishedTracker(PointwiseTracker):
     ) -> None:
         super().__init__(body, model, start)
         self._s = settings or PublishedSettings()
-        self._dropped_s = np.full(len(body.names), np.nan)
+
+
+class PublishedTracker(_PrintedTracker):
+    """Decoupled: filter 1 (bias, order 0) and filter 2 (position, order 2) for every point and axis."""
+
+    method = "published"
 
     def _begin(self, frame: Frame, ins: Integral) -> None:
         s = self._s
         self._origin, self._begun = ins, self._start_points(frame)
         self._origin_arms = self._arms_W(ins.C_WI)
+        self._dropped_s = np.full(len(self._begun), np.nan)
         x = np.zeros((3, self._begun.size))
         x[0] = self._begun.ravel()
         cov = np.diag([float(frame.var_mm2.max()), s.velocity_sd_mm_s**2, s.acceleration_sd_mm_s2**2])
@@ -99,7 +103,7 @@ class PublishedTracker(PointwiseTracker):
         return points, cov, ahead.x[1].reshape(-1, 3).mean(axis=0)
 
 
-class CoupledTracker(PointwiseTracker):
+class CoupledTracker(_PrintedTracker):
     """Coupled: six biases of the sensor from the first seen point, nine states (x, v, a by axis) for every point.
 
     H_A = [dp/db_a, dp/db_g] from the variational equations of the INS channel along its own path:
@@ -108,21 +112,10 @@ class CoupledTracker(PointwiseTracker):
 
     method = "coupled"
 
-    def __init__(
-        self,
-        body: BodyModel,
-        model: InertialModel,
-        start: Start | None = None,
-        settings: PublishedSettings | None = None,
-    ) -> None:
-        super().__init__(body, model, start)
-        self._s = settings or PublishedSettings()
-        self._theta, self._jv, self._jp = np.zeros((3, 6)), np.zeros((3, 6)), np.zeros((3, 6))
-        self._past: Integral | None = None
-
     def _begin(self, frame: Frame, ins: Integral) -> None:
         s, m = self._s, self._model
         self._origin = self._past = ins
+        self._theta, self._jv, self._jp = np.zeros((3, 6)), np.zeros((3, 6)), np.zeros((3, 6))
         self._begun, self._origin_arms = self._start_points(frame), self._arms_W(ins.C_WI)
         n = len(self._begun)
         self._x = np.zeros((n, 9))

@@ -38,3 +38,8 @@ def test_cells_without_live_and_options_without_it_are_refused(capsys: pytest.Ca
     assert "--live" in capsys.readouterr().err
     assert call(["track", str(TRACKED), str(TRACKED), "--live"]) == 2
     assert "one CELL" in capsys.readouterr().err
+
+
+def test_a_cell_without_live_is_said_to_be_no_recording(capsys: pytest.CaptureFixture[str]) -> None:
+    assert call(["track", str(TRACKED)]) == 2
+    assert "--live" in capsys.readouterr().err

@@ -8,12 +8,10 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 import can
-import numpy as np
 import pytest
 
-from docking.types import AxisState
 from drivers.links.can_bus import CanBusLink
-from tests.support.can_bench import follow, lags
+from tests.support.can_bench import assert_followed, follow
 
 durand = pytest.importorskip("durand")
 pytestmark = [pytest.mark.peer, pytest.mark.wires]
@@ -119,11 +117,7 @@ async def test_durand_slaves_are_brought_up_enabled_and_follow() -> None:
     try:
         feedback, path, identities = await follow(CanBusLink("virtual", CHANNEL, 1_000_000), 60)
         assert identities[6] == "durand slave 00000000h 1007"
-        assert feedback[0].states == (AxisState.ENABLED,) * 12
-        np.testing.assert_allclose(path[0], 0.1 * np.arange(1, 13), atol=1e-9)
-        np.testing.assert_allclose(feedback[-1].position_mm, path[-1], atol=0.51e-4)
-        assert feedback[-1].fault is None
-        assert all(1 <= behind <= 5 for behind in lags(feedback, path)), "never ahead of what was sent"
+        assert_followed(feedback, path)
         assert all(drive.stage == 0x40 for drive in drives)
         od = drives[3].od
         assert od.read(0x1016, 1) == 127 << 16 | 280

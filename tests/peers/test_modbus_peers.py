@@ -98,6 +98,20 @@ async def test_mbpoll_reads_int32_positions_high_word_first() -> None:
         assert "Illegal data address" in text
 
 
+async def play_to_the_end(driver: ModbusPositioners, table: Any, plant: Any) -> None:
+    """Run the plan, close the driver; the axes stand where the plan ends, braked."""
+    await driver.load(table)
+    await driver.command("run")
+    async with asyncio.timeout(20.0):
+        feedback = await driver.poll()
+        while not feedback.path_time_s >= table.duration_s:
+            await asyncio.sleep(0.05)
+            feedback = await driver.poll()
+    assert plant.position_mm == pytest.approx(table.q_mm[-1], abs=0.0006)
+    await driver.close()
+    assert plant.braked.all()
+
+
 async def test_the_driver_moves_the_plcs_over_loopback_in_real_time() -> None:
     async with simulated_plcs() as (plant, addresses):
         config = cell(timeout_s=0.5, watchdog_s=1.0)
@@ -106,16 +120,7 @@ async def test_the_driver_moves_the_plcs_over_loopback_in_real_time() -> None:
         assert [identity.serial for identity in identities] == ["SP-A", "SP-B", "SP-C", "SP-D"]
         await driver.enable()
         table = plan(config, 1.5)
-        await driver.load(table)
-        await driver.command("run")
-        async with asyncio.timeout(20.0):
-            feedback = await driver.poll()
-            while not feedback.path_time_s >= table.duration_s:
-                await asyncio.sleep(0.05)
-                feedback = await driver.poll()
-        assert plant.position_mm == pytest.approx(table.q_mm[-1], abs=0.0006)
-        await driver.close()
-        assert plant.braked.all()
+        await play_to_the_end(driver, table, plant)
 
 
 async def test_the_driver_moves_the_plcs_over_one_serial_line_in_real_time() -> None:
@@ -126,16 +131,7 @@ async def test_the_driver_moves_the_plcs_over_one_serial_line_in_real_time() -> 
         await driver.bring_up()
         await driver.enable()
         table = plan(config, 1.6)
-        await driver.load(table)
-        await driver.command("run")
-        async with asyncio.timeout(20.0):
-            feedback = await driver.poll()
-            while not feedback.path_time_s >= table.duration_s:
-                await asyncio.sleep(0.05)
-                feedback = await driver.poll()
-        assert plant.position_mm == pytest.approx(table.q_mm[-1], abs=0.0006)
-        await driver.close()
-        assert plant.braked.all()
+        await play_to_the_end(driver, table, plant)
 
 
 @asynccontextmanager

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from docking.config.cell import CellFile, DriveIdentity
 from docking.config.load import load_cell
-from docking.types import Array, Feedback
+from docking.types import Array, AxisState, Feedback
 from drivers.canopen.positioners import CanopenPositioners
 from drivers.links.can_bus import CanBusLink
 from sim.canopen import DriveGroup, DriveSettings
@@ -140,3 +140,12 @@ class Bench:
         """Bring up and enable; returns the read-back."""
         await self.master.bring_up()
         return (await self.master.enable()).position_mm
+
+
+def assert_followed(feedback: list[Feedback], path: list[Array]) -> None:
+    """Enabled where the drives stood (0.1 mm times their number), on the path, never ahead of what was sent."""
+    assert feedback[0].states == (AxisState.ENABLED,) * 12
+    np.testing.assert_allclose(path[0], 0.1 * np.arange(1, 13), atol=1e-9)
+    np.testing.assert_allclose(feedback[-1].position_mm, path[-1], atol=0.51e-4)
+    assert feedback[-1].fault is None
+    assert all(1 <= behind <= 5 for behind in lags(feedback, path)), "never ahead of what was sent"

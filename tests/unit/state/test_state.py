@@ -144,9 +144,9 @@ def test_every_state_can_be_reached_and_left():
 
 def reachable(start: Situation, *, without: set[Event] = frozenset()) -> set[Situation]:
     """All situations that any events but `without` can lead to."""
-    seen, todo = {start}, deque([start])
-    while todo:
-        situation = todo.popleft()
+    seen, open_ends = {start}, deque([start])
+    while open_ends:
+        situation = open_ends.popleft()
         for event in set(Event) - without:
             try:
                 following, _ = step(situation, event, "cause" if event is Event.FAULTED else None)
@@ -154,7 +154,7 @@ def reachable(start: Situation, *, without: set[Event] = frozenset()) -> set[Sit
                 continue
             if following not in seen:
                 seen.add(following)
-                todo.append(following)
+                open_ends.append(following)
     return seen
 
 
