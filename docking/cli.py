@@ -255,7 +255,7 @@ def study_dock(cells: tuple[Path, ...], as_json: bool, **options: Any) -> int:
     \b
     Example: docking study dock sim/cells/lab-can.toml --seeds 100
     """
-    from docking.study import StudyRequest, study_dock, study_text
+    from docking.study.dock import StudyRequest, study_dock, study_text
 
     result = study_dock(StudyRequest(cells=cells, **options), _say(as_json))
     if as_json:

@@ -83,7 +83,7 @@ def study_screening(draws: int, workers: int | None, as_json: bool) -> int:
     \b
     Example: docking study screening --draws 1000
     """
-    from docking.study_screening import study_screening, study_text
+    from docking.study.screening import study_screening, study_text
 
     result = study_screening(draws, workers, lambda text: print_text(text, err=as_json))
     if as_json:
@@ -114,8 +114,8 @@ def study_pose(draws: int, seed: int, out: Path, as_json: bool) -> int:
     from docking.report.sheet import check_drawing
 
     check_drawing()
-    from docking.study_pose import study_pose, study_text
-    from docking.study_pose.page import make_folder, write_study
+    from docking.study.pose import study_pose, study_text
+    from docking.study.pose.page import make_folder, write_study
 
     make_folder(out)
     result = study_pose(draws, seed, lambda text: print_text(text, err=True))
@@ -138,7 +138,7 @@ def study_real(folder: Path, as_json: bool) -> int:
     \b
     Example: docking study real-data ../shared/data
     """
-    from docking.study_real import real_text, study_real
+    from docking.study.real_data import real_text, study_real
 
     result = study_real(folder)
     if as_json:

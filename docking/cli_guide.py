@@ -289,7 +289,7 @@ def study_guidance(scenes: int, workers: int | None, report: Path | None, as_jso
     \b
     Example: docking study guidance --report guidance.html
     """
-    from docking.study_guidance import GuidanceStudy, study_guidance, study_text
+    from docking.study.guidance import GuidanceStudy, study_guidance, study_text
 
     result = study_guidance(GuidanceStudy(scenes, workers), lambda text: print_text(text, err=as_json))
     if report is not None:

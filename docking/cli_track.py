@@ -141,7 +141,7 @@ def study_tracking(runs: int, workers: int | None, report: Path | None, as_json:
     \b
     Example: docking study tracking --runs 24 --report tracking.html
     """
-    from docking.study_tracking import study_text, study_tracking
+    from docking.study.tracking import study_text, study_tracking
 
     if workers is not None and not workers >= 1:
         raise BadArgument("--workers", "at least one is needed", value=workers, limit=1)

@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 
 import sim
-from docking.study import StudyRequest, study_dock
+from docking.study.dock import StudyRequest, study_dock
 from tests.bench.metric import Metric, Sizes, median_ratio, side_by_side
 
 CELL = "lab-can"

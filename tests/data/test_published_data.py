@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from docking.cli import call
-from docking.study_real import study_real
+from docking.study.real_data import study_real
 from tests.data_truth.faro_bad_epochs import bad_epochs
 from tests.support.shared_data import shared_data
 
@@ -61,7 +61,7 @@ def test_a_tampered_epoch_is_noticed(tmp_path: Path) -> None:
             table[60, 0] += 0.3
         np.savetxt(tmp_path / file.name, table)
     assert 60 in bad_epochs(tmp_path)["floor"]["wrong"]
-    from docking.study_real import faro_epochs
+    from docking.study.real_data import faro_epochs
 
     row = faro_epochs(tmp_path)
     assert row["held"]

@@ -12,12 +12,12 @@ from docking.cli import call
 from docking.errors import BadArgument
 from docking.pose.batch import fit_poses, three_point_poses
 from docking.pose.three_point import fit_three_point
-from docking.study_pose import bars, study_pose
-from docking.study_pose.bars import FULL_DRAWS, Bar, allowance
-from docking.study_pose.claims import claims
-from docking.study_pose.layouts import BARREL, BOX, LAYOUTS, blocks
-from docking.study_pose.page import write_study
-from docking.study_pose.table import fitting_error_mm, rms_ratios
+from docking.study.pose import bars, study_pose
+from docking.study.pose.bars import FULL_DRAWS, Bar, allowance
+from docking.study.pose.claims import claims
+from docking.study.pose.layouts import BARREL, BOX, LAYOUTS, blocks
+from docking.study.pose.page import write_study
+from docking.study.pose.table import fitting_error_mm, rms_ratios
 
 DRAWS = 200
 

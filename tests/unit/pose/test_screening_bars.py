@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from docking.pose import FitSettings, fit_pose, screen
-from docking.study_screening import CASES, NOISES, Case, draw, run_case
+from docking.study.screening import CASES, NOISES, Case, draw, run_case
 from docking.types import Points, Pose
 
 WRONG = [case for case in CASES if case.wrong]

@@ -11,7 +11,7 @@ from scipy.stats import binomtest
 
 import sim
 from docking.errors import BadArgument
-from docking.study import StudyRequest, study_dock, study_text, summarise
+from docking.study.dock import StudyRequest, study_dock, study_text, summarise
 
 LAB = Path(sim.__file__).parent / "cells" / "lab-can.toml"
 

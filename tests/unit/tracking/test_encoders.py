@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 import pytest
 
-from docking.study_tracking import CASES, run
+from docking.study.tracking import CASES, run
 from docking.tracking.encoders import EncoderTracker
 from docking.types import Pose
 from tests.unit.tracking.moving_body import section

@@ -17,7 +17,7 @@ from docking.pose.batch import PoseBatch, fit_poses, three_point_poses
 from docking.pose.least_squares import design
 from docking.pose.three_point import best_triangle
 from docking.pose.uncertainty import pose_difference
-from docking.study_pose.layouts import BARREL, HALF_LENGTH_MM, RADIUS_MM, WING, Generator, random_barrel, random_pose
+from docking.study.pose.layouts import BARREL, HALF_LENGTH_MM, RADIUS_MM, WING, Generator, random_barrel, random_pose
 from docking.types import Array, Pose, Screened
 
 Noise = Callable[[Array], Array]

@@ -18,9 +18,9 @@ from docking.geometry import euler_to_matrix, exp_so3, matrix_to_euler
 from docking.pose.least_squares import MAX_ITERATIONS, euler_jacobian, fit_gauss_newton
 from docking.pose.svd import fit_svd
 from docking.pose.three_point import fit_three_point
-from docking.study_pose.curves import REACHED_MM, gap_mm
-from docking.study_pose.layouts import BARREL, Generator, random_pose
-from docking.study_pose.table import AMPLITUDE_MM
+from docking.study.pose.curves import REACHED_MM, gap_mm
+from docking.study.pose.layouts import BARREL, Generator, random_pose
+from docking.study.pose.table import AMPLITUDE_MM
 from docking.types import Array, Pose
 
 OFFS_DEG = (10.0, 45.0, 90.0, 135.0, 175.0)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from docking.report.figures import COLOURS, GREY, LIMIT, panels
-from docking.study_pose.curves import AMPLITUDES_MM
-from docking.study_pose.table import PAPER_MM
+from docking.study.pose.curves import AMPLITUDES_MM
+from docking.study.pose.table import PAPER_MM
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

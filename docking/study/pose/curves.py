@@ -10,8 +10,8 @@ from docking.errors import NotCongruent
 from docking.pose.batch import fit_poses
 from docking.pose.least_squares import fit_gauss_newton
 from docking.pose.svd import fit_svd
-from docking.study_pose.layouts import BARREL, LAYOUTS, POINTS, Block, Generator, Layout, blocks, random_pose
-from docking.study_pose.table import AMPLITUDE_MM, fitting_error_mm, spread_of
+from docking.study.pose.layouts import BARREL, LAYOUTS, POINTS, Block, Generator, Layout, blocks, random_pose
+from docking.study.pose.table import AMPLITUDE_MM, fitting_error_mm, spread_of
 from docking.types import Array, Pose
 
 COUNTS = range(3, POINTS + 1)

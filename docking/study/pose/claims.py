@@ -5,8 +5,8 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-from docking.study_pose.bars import allowance
-from docking.study_pose.table import PAPER_MM
+from docking.study.pose.bars import allowance
+from docking.study.pose.table import PAPER_MM
 
 _BAND = 0.03
 """Two figures this near are the same; for few draws their sampling error is added."""

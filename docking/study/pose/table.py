@@ -10,7 +10,7 @@ from docking.pose import METHODS, FitSettings, fit_pose
 from docking.pose.batch import PoseBatch, fit_poses, three_point_poses
 from docking.pose.least_squares import fit_gauss_newton
 from docking.pose.three_point import best_triangle
-from docking.study_pose.layouts import LAYOUTS, Block, Generator, Layout, blocks
+from docking.study.pose.layouts import LAYOUTS, Block, Generator, Layout, blocks
 from docking.types import Array, Pose, Screened
 
 AMPLITUDE_MM = 0.5

@@ -10,9 +10,9 @@ from docking.errors import FileUnwritable
 from docking.journal import canonical
 from docking.report.figures import style, svg
 from docking.report.sheet import table, write_sheet
-from docking.study_pose.claims import claims
-from docking.study_pose.drawings import drawings
-from docking.study_pose.table import PAPER_MM
+from docking.study.pose.claims import claims
+from docking.study.pose.drawings import drawings
+from docking.study.pose.table import PAPER_MM
 
 TITLE = "A pose from points: the paper's study with many draws"
 

@@ -1,6 +1,6 @@
 """The study of [Luo] with many draws: Table 1, Fig. 2, Fig. 3, where least squares may start, and the physical limit.
 
-`study_pose(draws, seed, say)` computes everything, `docking.study_pose.page` draws it beside the paper's figures.
+`study_pose(draws, seed, say)` computes everything, `docking.study.pose.page` draws it beside the paper's figures.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from docking.errors import BadArgument
-from docking.study_pose.bars import bar_text, bars
-from docking.study_pose.bound import bound_of, cases
-from docking.study_pose.curves import number_of_points, size_of_errors
-from docking.study_pose.layouts import LAYOUTS
-from docking.study_pose.starts import starts
-from docking.study_pose.table import noiseless_mm, rms_ratios, table_of
+from docking.study.pose.bars import bar_text, bars
+from docking.study.pose.bound import bound_of, cases
+from docking.study.pose.curves import number_of_points, size_of_errors
+from docking.study.pose.layouts import LAYOUTS
+from docking.study.pose.starts import starts
+from docking.study.pose.table import noiseless_mm, rms_ratios, table_of
 
 __all__ = ["bar_text", "bars", "study_pose", "study_text"]
 
