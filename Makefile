@@ -14,12 +14,10 @@ dock: $(VENV)/.installed
 	$(BIN)/docking dry-run $(CELL) --report $(RUNS)/report.html
 	@echo "Report: $(RUNS)/report.html"
 
-# Real-time tests run beside the others, which step back for them: their ticks must not wait for a Monte Carlo.
+# Real-time tests run last and alone: their ticks must not wait for a Monte Carlo.
 test: $(VENV)/.installed-dev lint
-	@mkdir -p $(RUNS)
-	@$(BIN)/pytest -q -m wires > $(RUNS)/wires.log 2>&1 & wires=$$!; \
-	nice -n 15 $(BIN)/pytest -n 2 -m "not wires"; others=$$?; \
-	wait $$wires; real=$$?; cat $(RUNS)/wires.log; exit $$((others | real))
+	$(BIN)/pytest -n 2 -m "not wires"; others=$$?; \
+	$(BIN)/pytest -m wires; exit $$((others | $$?))
 
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

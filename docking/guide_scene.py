@@ -309,6 +309,6 @@ def tick(journal: Path, source: Source, step: str, by: str, *, done: bool) -> No
         raise BadArgument("--by", "who has done it must have a name", value=by)
     file = JournalFile(journal, time.monotonic)
     try:
-        file.write(STEP_KIND, {"step": step, "done": done, "by": by.strip()}, durable=True)
+        file.write(STEP_KIND, {"step": step, "done": done, "by": by.strip()})
     finally:
         file.close()

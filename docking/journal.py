@@ -27,6 +27,7 @@ from typing import Any, Final
 import numpy as np
 
 from docking.errors import FileUnreadable, JournalBusy, JournalCorrupt, JournalUnwritable
+from docking.ports import Aside, at_once
 
 GENESIS: Final = "0" * 64
 KEYS: Final = frozenset({"seq", "boot_id", "t_mono_s", "t_wall", "kind", "body", "prev_sha", "sha"})
@@ -46,12 +47,19 @@ class Chain:
 class JournalFile:
     """The `docking.ports.Journal` of one run, held by this process alone (flock) until `close`.
 
-    `clock` gives the loop's time in s, `wall` the time of day. Records of earlier runs in the same file are verified
-    and continued. Raises JournalBusy, JournalCorrupt, JournalUnwritable, FileUnreadable.
+    `clock` gives the loop's time in s, `wall` the time of day; the disk is waited for `aside`. Records of earlier runs
+    in the same file are verified and continued. Raises JournalBusy, JournalCorrupt, JournalUnwritable, FileUnreadable.
     """
 
-    def __init__(self, path: Path, clock: Callable[[], float], wall: Callable[[], datetime] | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        clock: Callable[[], float],
+        wall: Callable[[], datetime] | None = None,
+        aside: Aside = at_once,
+    ) -> None:
         self.path = path
+        self._aside = aside
         self._clock = clock
         self._wall = wall or _utc_now
         self._boot_id = uuid.uuid4().hex
@@ -76,10 +84,9 @@ class JournalFile:
         """`sha` of the newest record; GENESIS while the journal is empty."""
         return self._head
 
-    def write(self, kind: str, body: dict[str, Any], *, durable: bool = False) -> None:
-        """Append one record; `durable` returns only after fdatasync. The first failure ends the journal for good."""
-        if self._failed is not None or not self._open:
-            raise JournalUnwritable(str(self.path), self._failed or "closed")
+    def write(self, kind: str, body: dict[str, Any]) -> None:
+        """Append one record. The first failure, here or in `sync`, ends the journal for good."""
+        self._require_usable()
         record = {
             "seq": self._count,
             "boot_id": self._boot_id,
@@ -92,13 +99,26 @@ class JournalFile:
         line, sha = _sealed(record)
         try:
             _write_all(self._fd, line)
-            if durable:
-                os.fdatasync(self._fd)
         except OSError as error:
-            # A failed sync may have dropped the dirty pages: a second try that succeeds would prove nothing.
-            self._failed = error.strerror or str(error)
-            raise JournalUnwritable(str(self.path), self._failed) from error
+            raise self._failure(error) from error
         self._count, self._head = self._count + 1, sha
+
+    async def sync(self) -> None:
+        """Return when every record written so far is on the disk, which may take a busy disk a second."""
+        self._require_usable()
+        try:
+            await self._aside(lambda: os.fdatasync(self._fd))
+        except OSError as error:
+            raise self._failure(error) from error
+
+    def _require_usable(self) -> None:
+        if self._failed is not None or not self._open:
+            raise JournalUnwritable(str(self.path), self._failed or "closed")
+
+    def _failure(self, error: OSError) -> JournalUnwritable:
+        """A failed sync may have dropped the dirty pages: a second try that succeeds would prove nothing."""
+        self._failed = error.strerror or str(error)
+        return JournalUnwritable(str(self.path), self._failed)
 
     def close(self) -> None:
         """Make everything durable and let the file go. May be called twice."""

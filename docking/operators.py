@@ -87,6 +87,10 @@ class TerminalOperator:
         asyncio.get_running_loop().add_reader(self._descriptor, self._readable)
 
     def _readable(self) -> None:
+        """Take what was typed, and return at once where nothing is: a question put in the same turn of the loop may
+        have taken it already, and the loop must not wait for the next line."""
+        if not self._pending():
+            return
         try:
             data = os.read(self._descriptor, 4096)
         except OSError:
@@ -101,6 +105,9 @@ class TerminalOperator:
         *lines, self._typed = (self._typed + data).split(b"\n")
         for line in lines:
             self._take(line.decode("utf-8", "replace").strip().lower())
+
+    def _pending(self) -> bool:
+        return bool(select.select([self._descriptor], [], [], 0.0)[0])
 
     def _take(self, word: str) -> None:
         if word in _ABORT:
@@ -197,7 +204,7 @@ class TerminalOperator:
 
     async def _ask(self, expected: frozenset[str], key: str, **facts: Any) -> str:
         self._engaged, self._asked = True, expected
-        while not self._gone and select.select([self._descriptor], [], [], 0.0)[0]:
+        while not self._gone and self._pending():
             # What was typed ahead reaches nobody but an abort.
             self._readable()
         answer: asyncio.Future[str] = asyncio.get_running_loop().create_future()

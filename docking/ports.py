@@ -259,9 +259,13 @@ class Motion(Protocol):
 
 
 class Journal(Protocol):
-    """Write-ahead record of everything that happens; `write` returns after the record is durable when `durable`."""
+    """Write-ahead record of everything that happens."""
 
-    def write(self, kind: str, body: dict[str, Any], *, durable: bool = False) -> None: ...
+    def write(self, kind: str, body: dict[str, Any]) -> None: ...
+
+    async def sync(self) -> None:
+        """Return when everything that has been written is durable; the loop goes on meanwhile."""
+        ...
 
     def close(self) -> None: ...
 

@@ -276,7 +276,8 @@ class Procedure(Activity[Progress]):
         p, plan = self.progress, self.known.plan()
         self._check_start(plan)
         guard = await self._retreat.guard() if plan.kind == "retreat" else None
-        self.journal.write("intent", records.intent_record(plan), durable=True)
+        self.journal.write("intent", records.intent_record(plan))
+        await self.journal.sync()
         await self.motion.load(plan)
         facts = {"kind": plan.kind, "stage": plan.stage, "limited_by": plan.speed_limited_by}
         self.operator.notify("moving", duration_s=plan.duration_s, **facts)

@@ -160,7 +160,8 @@ class Relief(Activity[ReliefProgress]):
         p = self.progress
         if p.plan is None or p.strain is None:
             raise PlanStale("relief", "no step is planned")
-        self.journal.write("intent", records.intent_record(p.plan), durable=True)
+        self.journal.write("intent", records.intent_record(p.plan))
+        await self.journal.sync()
         await self.motion.load(replace(p.plan, requires=self.run.permissives))
         result, cause = await self._guard(p.plan, p.strain).run(self.motion, p.plan.plan_hash)
         p.steps, p.commanded_mm, p.result = p.steps + 1, result.commanded_mm, result

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from docking.assemble.controller import Company
-from docking.assemble.real_time import on_interrupt, run_real
+from docking.assemble.real_time import aside, on_interrupt, run_real
 from docking.assemble.requests import Files, RunRequest, Say, WireChoice, journal_path, load_files, read_wires
 from docking.assemble.simulated import make_far_end, real_wires, truth_of
 from docking.assemble.spawned import MotionProcess
@@ -105,7 +105,7 @@ async def _relieve(run: _Run, process: MotionProcess, found: dict[str, Any]) -> 
     """Relieve once on the running loop and close the journal with the outcome."""
     loop, files, operator = asyncio.get_running_loop(), run.files, run.operator
     started_s = loop.time()
-    journal = JournalFile(run.journal_path, loop.time)
+    journal = JournalFile(run.journal_path, loop.time, aside=aside)
 
     def hear(kind: str, body: Any) -> None:
         named = kind if kind in LATENESS else "motion_process"
@@ -114,7 +114,8 @@ async def _relieve(run: _Run, process: MotionProcess, found: dict[str, Any]) -> 
             operator.notify("no_priority")
 
     try:
-        journal.write("run_started", _started(run), durable=True)
+        journal.write("run_started", _started(run))
+        await journal.sync()
         paths = (run.request.run.cell_path, files.job_path)
         motion = await process.join(paths, files.cell, found, hear)
         cell = build_relief(files, motion, Company(journal, operator, loop.time), run.request.supervisor, run.tare)
@@ -126,7 +127,8 @@ async def _relieve(run: _Run, process: MotionProcess, found: dict[str, Any]) -> 
             journal.write("motion_process", await process.end())
         elapsed_s = loop.time() - started_s
         summary = {"outcome": OUTCOMES[state], **summary_of(cell.procedure), "elapsed_s": elapsed_s}
-        journal.write("outcome", summary, durable=True)
+        journal.write("outcome", summary)
+        await journal.sync()
         return summary
     finally:
         journal.close()

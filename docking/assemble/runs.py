@@ -146,12 +146,14 @@ async def _dock(run: _Run) -> dict[str, Any]:
     """Dock once on the running loop and close the journal with the outcome."""
     loop = asyncio.get_running_loop()
     started_s, wall_s = loop.time(), time.perf_counter()
-    journal: Journal = JournalFile(run.journal_path, loop.time)
+    work = aside if run.joined else at_once
+    journal: Journal = JournalFile(run.journal_path, loop.time, aside=work)
     watched = WatchedJournal(journal, run.far) if run.scenario is not None and run.far is not None else None
     journal = watched or journal
     try:
-        journal.write("run_started", _started(run), durable=True)
-        company = Company(journal, run.operator, loop.time, aside if run.joined else at_once, run.step)
+        journal.write("run_started", _started(run))
+        await journal.sync()
+        company = Company(journal, run.operator, loop.time, work, run.step)
         motion = await _joined_motion(run, run.joined, journal) if run.joined else None
         cell = build_cell(run.files.cell, run.files.job, run.wires, company, motion)
         if watched is not None:
@@ -169,7 +171,8 @@ async def _dock(run: _Run) -> dict[str, Any]:
         if run.scenario is not None:
             met = as_expected(run.scenario, summary["outcome"], summary["alarms"])
             summary["scenario"] = {"name": run.scenario.name, "as_expected": met}
-        journal.write("outcome", summary, durable=True)
+        journal.write("outcome", summary)
+        await journal.sync()
         return summary
     finally:
         journal.close()

@@ -65,10 +65,13 @@ class WatchedJournal:
         """From now on `runner` hears of the states of `cell`."""
         self._cell, self._runner = cell, runner
 
-    def write(self, kind: str, body: dict[str, Any], *, durable: bool = False) -> None:
-        self._journal.write(kind, body, durable=durable)
+    def write(self, kind: str, body: dict[str, Any]) -> None:
+        self._journal.write(kind, body)
         if kind == "state" and self._runner is not None and self._cell is not None:
             self._runner.entered(body["to"], self._stage(self._cell), self._share)
+
+    async def sync(self) -> None:
+        await self._journal.sync()
 
     def close(self) -> None:
         if self._runner is not None:

@@ -52,10 +52,13 @@ class Tap:
         self._file = JournalFile(path, clock)
         self.hooks: list[Callable[[str, dict[str, Any]], None]] = []
 
-    def write(self, kind: str, body: dict[str, Any], *, durable: bool = False) -> None:
-        self._file.write(kind, body, durable=durable)
+    def write(self, kind: str, body: dict[str, Any]) -> None:
+        self._file.write(kind, body)
         for hook in self.hooks:
             hook(kind, body)
+
+    async def sync(self) -> None:
+        await self._file.sync()
 
     def close(self) -> None:
         self._file.close()

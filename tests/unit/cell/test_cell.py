@@ -57,7 +57,7 @@ class Everything:
 
         return perform
 
-    def write(self, kind: str, body: dict, *, durable: bool = False) -> None:
+    def write(self, kind: str, body: dict) -> None:
         self.records.append((kind, body))
 
     def notify(self, key: str, **facts: object) -> None:
@@ -143,7 +143,7 @@ def test_what_slows_the_axes_is_asked_for_before_it_is_written_and_what_moves_th
 
 
 def test_a_journal_that_fails_does_not_keep_a_hold_from_the_axes():
-    def write(kind: str, body: dict, *, durable: bool = False) -> None:
+    def write(kind: str, body: dict) -> None:
         if body.get("event") == Event.HOLD.value:
             raise OSError("the disk is full")
 

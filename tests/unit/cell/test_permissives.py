@@ -32,7 +32,7 @@ class Book:
     def __init__(self) -> None:
         self.bodies: list[dict] = []
 
-    def write(self, kind: str, body: dict, *, durable: bool = False) -> None:
+    def write(self, kind: str, body: dict) -> None:
         self.bodies.append(body)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import select
 from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
 
@@ -147,3 +148,28 @@ async def test_nobody_decides_by_itself():
     nobody = AutomaticOperator([].append)
     assert await nobody.hold_to_run(FACTS) is False
     assert await nobody.blocked(UNSEEN, retreatable=True) is None
+
+
+async def test_a_question_that_takes_what_was_typed_ahead_leaves_nothing_to_wait_for(keyboard, monkeypatch):
+    """Both happen in one turn of the loop, which also serves the lease: it must not sit until the next line."""
+    real_read, waits = os.read, []
+
+    def read(descriptor: int, size: int) -> bytes:
+        if select.select([descriptor], [], [], 0.0)[0]:
+            return real_read(descriptor, size)
+        waits.append(descriptor)
+        return b"\n"
+
+    monkeypatch.setattr(operators.os, "read", read)
+    loop, operator = asyncio.get_running_loop(), TerminalOperator(keyboard.said.append, "en")
+    operator.attend(keyboard.events.append, keyboard.percents.append)
+    try:
+        question = loop.create_task(operator.blocked(UNSEEN, retreatable=False))
+        keyboard.type("m")
+        await asyncio.sleep(0.01)
+        assert not question.done(), "what was typed ahead confirms nothing"
+        keyboard.type("m")
+        assert await asyncio.wait_for(question, 5.0) is Event.AGAIN
+    finally:
+        loop.remove_reader(keyboard.near)
+    assert waits == [], "the loop waited for the next line"

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import json
 import multiprocessing
 import os
+import threading
 from datetime import UTC, datetime
 from enum import Enum
 from pathlib import Path
@@ -43,7 +45,7 @@ def small(tmp_path: Path) -> Path:
     path = tmp_path / "run.jsonl"
     journal = open_journal(path)
     journal.write("run_started", {"cell": "机身", "eps": 1e-05, "text": "a\x1b*/\n"})
-    journal.write("intent", {"plan_hash": "ab12", "start_mm": {"A.X": 0.1, "A.Y": -3.0}}, durable=True)
+    journal.write("intent", {"plan_hash": "ab12", "start_mm": {"A.X": 0.1, "A.Y": -3.0}})
     journal.write("outcome", {"outcome": "docked", "e_mm": 0.30000000000000004})
     journal.close()
     return path
@@ -95,7 +97,7 @@ def test_truncation_at_every_offset_keeps_the_whole_records_and_goes_on(small: P
         kept = sum(end <= size for end in ends)  # a record that lacks only its line feed is whole
         assert verify(cut).count == kept
         journal = open_journal(cut)
-        journal.write("state", {"to": "FAULT"}, durable=True)
+        journal.write("state", {"to": "FAULT"})
         journal.close()
         records = read(cut)
         assert [r["kind"] for r in records] == [*["run_started", "intent", "outcome"][:kept], "state"]
@@ -245,7 +247,9 @@ def test_only_one_program_holds_a_journal(small: Path) -> None:
     open_journal(small).close()
 
 
-def test_durable_means_synced_before_return(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_sync_is_over_when_all_that_was_written_is_on_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     journal = open_journal(tmp_path / "run.jsonl")
     synced: list[int] = []
     real = os.fdatasync
@@ -255,25 +259,46 @@ def test_durable_means_synced_before_return(tmp_path: Path, monkeypatch: pytest.
         real(fd)
 
     monkeypatch.setattr(os, "fdatasync", fdatasync)
-    journal.write("state", {})
+    journal.write("intent", {"plan_hash": "a"})
     assert synced == []
-    journal.write("intent", {"plan_hash": "a"}, durable=True)
+    await journal.sync()
     assert synced == [(tmp_path / "run.jsonl").stat().st_size]
     journal.close()
 
 
-def test_a_failed_sync_ends_the_journal_for_good(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_slow_disk_keeps_neither_the_loop_nor_a_record_waiting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    journal = JournalFile(tmp_path / "run.jsonl", clock=Ticks(), aside=asyncio.to_thread)
+    disk = threading.Event()
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fdatasync", lambda fd: disk.wait(30.0))
+        journal.write("intent", {"plan_hash": "a"})
+        waiting = asyncio.create_task(journal.sync())
+        await asyncio.sleep(0)
+        journal.write("command", {"verb": "stop"})
+        assert not waiting.done()
+        disk.set()
+        await waiting
+    journal.close()
+    assert [r["kind"] for r in read(tmp_path / "run.jsonl")] == ["intent", "command"]
+
+
+async def test_a_failed_sync_ends_the_journal_for_good(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     journal = open_journal(tmp_path / "run.jsonl")
 
     def no_disk(_: int) -> None:
         raise OSError(5, "Input/output error")
 
+    journal.write("intent", {})
     with monkeypatch.context() as patch:
         patch.setattr(os, "fdatasync", no_disk)
         with pytest.raises(JournalUnwritable, match="Input/output error"):
-            journal.write("intent", {}, durable=True)
+            await journal.sync()
     with pytest.raises(JournalUnwritable, match="Input/output error"):
         journal.write("state", {})
+    with pytest.raises(JournalUnwritable, match="Input/output error"):
+        await journal.sync()
     journal.close()
 
 
