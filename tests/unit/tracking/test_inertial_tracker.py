@@ -142,6 +142,26 @@ def test_the_smoother_knows_what_came_after_the_gap() -> None:
     assert all(g.max_error_mm < 6.0 for g in after)
 
 
+def test_the_smoother_says_how_far_off_it_is() -> None:
+    """In gaps its error in units of its own sd has the size of one; later data make no state less certain."""
+    off, filtered, smooth = [], [], []
+    for seed in (7, 17, 27):
+        recording, truth, _ = record(POINT, 21.0, "mems", seed)
+        gaps = [Gap(7.0, 3.0), Gap(15.0, 3.0)]
+        hide = hidden(recording, gaps)
+        tracker = InertialTracker(POINT, GRADES["mems"], start_of(recording), tape=Tape())
+        causal = play(recording, tracker, hide)
+        path = smoothed_path(recording, tracker, causal)
+        blind = hide[path.frame] >= 0
+        error = np.linalg.norm(path.points_W_mm[blind] - truth[path.frame[blind]], axis=2)
+        off.append(error / path.sd_mm[blind])
+        filtered.append(causal.sd_mm[blind])
+        smooth.append(path.sd_mm[blind])
+    assert np.all(np.concatenate(smooth) <= 1.001 * np.concatenate(filtered))
+    assert np.concatenate(smooth).max() < 0.25 * np.concatenate(filtered).max()
+    assert 0.5 <= float(np.sqrt(np.mean(np.concatenate(off) ** 2))) <= 1.5  # six gaps, two bends of the error in each
+
+
 def test_rest_is_held_and_creeping_is_not_taken_for_rest_when_said_so() -> None:
     recording, truth, _ = record(POINT, 14.0, "mems", 8)
     t = recording.imu_t_s
