@@ -2,13 +2,13 @@
 
 A vertical axis without torque is driven back by the weight: `a t^2 / 2` until its brake holds. One axis alone, or all
 of them with brakes that close at different times, force the part out of shape; only a controlled stop first (SS1) does
-not.
+not. An axis that holds a force holds a position as soon as its brake has closed.
 """
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,19 +18,25 @@ from docking.config.budget import docked_pose
 from docking.config.build import load_from, positioners_from
 from docking.config.cell import CellFile
 from docking.config.job import JobFile
-from docking.kinematics import internal_force_matrix, warp_rows
+from docking.kinematics import Positioners, internal_force_matrix, warp_rows
 from docking.planning.jam import residual_matrix
 from docking.types import Array
 
+BLIND_MM = 0.05
+"""A millimetre that shows as less than this is not seen: the figure's own errors are as large."""
 _MOST_PATTERNS = 12
 
 
 @dataclass(frozen=True)
 class Detectability:
     """What 1 mm of error of one axis of a kind shows, least over the axes of that kind that hold a position: at the
-    worst ball and over all balls (rss) in mm, as internal force and as warp in N."""
+    worst ball and over all balls (rss) in mm, as internal force and as warp in N.
+
+    `seen`: what the monitor of all read-backs shows at the worst ball, mm, where only the encoder errs. Encoders of
+    axes that follow count: the part really goes where the axis does."""
 
     kind: str
+    seen: float
     worst_ball: float
     all_balls: float
     force_n: float
@@ -60,14 +66,25 @@ class _Matrices:
     residual: Array
     force: Array
     warp: Array
+    read_backs: Array
 
 
-def _matrices(cell: CellFile, job: JobFile) -> _Matrices:
+def _matrices(cell: CellFile, job: JobFile, *, braked: bool = False) -> _Matrices:
+    """`braked`: every axis that has a brake holds its position."""
     positioners, up = positioners_from(cell, job), load_from(cell, job).up
     balls = docked_pose(cell, job).apply(positioners.balls_C_mm)
+    seen = residual_matrix(_holding(positioners, np.ones(len(positioners.axes), dtype=np.bool_)), balls)
+    if braked:
+        positioners = _holding(positioners, positioners.powered)
     force, modes = internal_force_matrix(positioners, balls), warp_rows(balls, up)
     vertical = np.einsum("wk,c->wkc", modes, up).reshape(len(modes), len(force))
-    return _Matrices(residual_matrix(positioners, balls), force, vertical @ force)
+    return _Matrices(residual_matrix(positioners, balls), force, vertical @ force, seen)
+
+
+def _holding(positioners: Positioners, axes: NDArray[np.bool_]) -> Positioners:
+    """The positioners with these axes (m,) holding a position, and no others anything."""
+    none = np.zeros(len(axes))
+    return replace(positioners, driven=axes, held_n=none, held_tolerance_n=none)
 
 
 def _worst(vectors: Array) -> Array:
@@ -79,21 +96,22 @@ def _worst(vectors: Array) -> Array:
 def detectability(cell: CellFile, job: JobFile) -> tuple[Detectability, ...]:
     """One row for each kind of axis that holds a position somewhere."""
     m, driven = _matrices(cell, job), np.array(cell.driven)
-    worst, force = _worst(m.residual), _worst(m.force)
+    seen, worst, force = _worst(m.read_backs), _worst(m.residual), _worst(m.force)
     together, warp = np.linalg.norm(m.residual, axis=0), np.abs(m.warp).max(axis=0, initial=0.0)
     found = []
     for kind in "XYZ":
         rows = np.flatnonzero(driven & np.array([name.endswith(f".{kind}") for name in cell.axis_names]))
         if len(rows):
-            least = [float(values[rows].min()) for values in (worst, together, force, warp)]
+            least = [float(values[rows].min()) for values in (seen, worst, together, force, warp)]
             found.append(Detectability(kind, *least))
     return tuple(found)
 
 
 def torque_off(cell: CellFile, job: JobFile) -> TorqueOff | None:
     """The cost of a category-0 stop; None where every axis holds itself."""
-    m = _matrices(cell, job)
-    back = np.array([p.back_drive_m_s2 * (axis.name == "Z") for p in cell.positioners for axis in p.axes]) * cell.driven
+    m = _matrices(cell, job, braked=True)
+    back = np.array([p.back_drive_m_s2 * (axis.name == "Z") for p in cell.positioners for axis in p.axes])
+    back *= cell.powered
     brakes = np.array([p.brake_s for p in cell.positioners for _ in p.axes])
     first, last = (500.0 * back[:, None] * brakes**2).T
     rows = np.flatnonzero(last > 0.0)
@@ -133,11 +151,16 @@ def strain_json(cell: CellFile, job: JobFile) -> dict[str, Any]:
 
 def strain_text(cell: CellFile, job: JobFile) -> list[str]:
     """What one axis's error shows and what torque off costs, in words."""
-    rows = ["1 mm of error of one axis   worst ball mm   all balls mm   internal force N   warp N"]
+    rows = ["1 mm of error of one axis   seen mm   worst ball mm   all balls mm   internal force N   warp N"]
+    shown = detectability(cell, job)
     rows += [
-        f"  {row.kind:<26}{row.worst_ball:13.2f}{row.all_balls:15.2f}{row.force_n:19.0f}{row.warp_n:9.0f}"
-        for row in detectability(cell, job)
+        f"  {row.kind:<26}{row.seen:8.2f}{row.worst_ball:16.2f}{row.all_balls:15.2f}"
+        f"{row.force_n:19.0f}{row.warp_n:9.0f}"
+        for row in shown
     ]
+    blind = [row.kind for row in shown if not row.seen >= BLIND_MM]
+    if blind:
+        rows.append(f"  no read-back shows an encoder of {' or '.join(blind)} that errs: the tracker alone does")
     off = torque_off(cell, job)
     if off is None:
         return [*rows, "category-0 stop: every axis holds itself without torque"]

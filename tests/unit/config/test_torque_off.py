@@ -1,4 +1,4 @@
-"""What `docking check` says of a single axis's error and of torque off, against the numbers of the domain page."""
+"""What `docking check` says of a single axis's error and of torque off, against the numbers of docs/mechanics.md."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def changed(cell: CellFile, **of_positioners: object) -> CellFile:
     return cell.model_copy(update={"positioners": tuple(p.model_copy(update=of_positioners) for p in cell.positioners)})
 
 
-def test_a_single_axis_shows_what_the_domain_says() -> None:
+def test_a_single_axis_shows_its_share_at_the_balls() -> None:
     """RC-1: 0.83, 0.75, 0.50 of itself over all balls; 5 kN of warp a millimetre of a vertical axis."""
     rows = {row.kind: row for row in detectability(*files("fuselage-can"))}
     assert [rows[k].all_balls for k in "XYZ"] == pytest.approx([0.83, 0.75, 0.50], abs=0.01)
@@ -36,6 +36,28 @@ def test_what_only_one_axis_drives_shows_nothing() -> None:
     rows = {row.kind: row for row in detectability(*files("follower-can"))}
     assert rows["X"].worst_ball < 1e-3
     assert rows["Z"].worst_ball == pytest.approx(0.25, abs=0.01)
+
+
+def test_encoders_of_axes_that_follow_show_the_error_of_one_that_leads() -> None:
+    """Where the axis errs, the part goes with it, and the others' encoders show that as if they all led."""
+    whole = {row.kind: row.seen for row in detectability(*files("fuselage-can"))}
+    assert [whole[k] for k in "XYZ"] == pytest.approx([0.69, 0.58, 0.25], abs=0.01)
+    for name in ("follower-can", "follower-force-can"):
+        assert {row.kind: row.seen for row in detectability(*files(name))} == pytest.approx(whole, abs=0.01)
+    told = {name: "\n".join(strain_text(*files(name))) for name in ("follower-force-can", "wing-modbus")}
+    assert "tracker alone" not in told["follower-force-can"]
+    # Three balls: whatever height the three vertical axes say, some attitude has it.
+    assert "an encoder of Z that errs: the tracker alone" in told["wing-modbus"]
+
+
+def test_a_held_force_is_a_held_position_once_its_brake_has_closed() -> None:
+    """Six axes lead: nothing strains the part in a move. In a stop of category 0 four brakes close, as in RC-1."""
+    held, leading = (torque_off(*files(name)) for name in ("follower-force-can", "fuselage-can"))
+    assert held is not None
+    assert leading is not None
+    assert held.all_force_n == pytest.approx(leading.all_force_n, rel=0.01)
+    assert held.one_force_n == pytest.approx(12500.0, rel=0.01)
+    assert held.needs_ss1
 
 
 def test_torque_off_of_one_and_of_all_axes() -> None:
