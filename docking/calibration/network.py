@@ -3,7 +3,8 @@
 W is defined by ERS points, or, without them, is the frame of the first station. Points in common place the stations one
 after another with the same fit and screening as a single station; then all are adjusted together, and data snooping
 looks for single bad observations: one that three or more views of a point single out goes, and where only two views
-disagree the point goes, since nobody can say which is wrong.
+disagree the point goes, since nobody can say which is wrong. What goes is named as in the fit of one station: swapped,
+in a wrong nest, in another unit, moved with others, or mis-aimed.
 """
 
 from __future__ import annotations
@@ -18,9 +19,12 @@ from docking.calibration.station import locate_station, to_world
 from docking.errors import NotCongruent, SigmaMissing, TooFewPoints
 from docking.pose.clique import adjacency, bits, largest_clique
 from docking.pose.layout import MIN_POINTS
+from docking.pose.pairs import pair_tolerance_mm
 from docking.pose.passes import average_passes
 from docking.pose.quantiles import chi2_tail, chi2_upper
+from docking.pose.reasons import explain
 from docking.pose.settings import FitSettings
+from docking.pose.snooping import Pairs
 from docking.types import Array, Points, Pose, Rejection
 
 ERS = "ERS"
@@ -29,6 +33,8 @@ GROSS_ALARM = 0.001
 """Probability at which the whole network counts as inconsistent."""
 _PLACING_ALARM = 1e-6
 """A station is placed with what is not grossly off; what is nearly right is judged by all stations together."""
+_TELLING = ("swapped", "wrong-nest", "unit-mix-up")
+"""Reasons of a pair of views that say more than how far apart they are."""
 _NO_EVIDENCE = 1e-6
 """A direction of a residual with less than this share of the observation's variance carries no evidence."""
 
@@ -126,12 +132,13 @@ class _Book:
         return Points(names, self.observations.xyz_mm[rows], self.observations.cov_mm2[rows])
 
 
-def _placed(book: _Book) -> tuple[tuple[Pose, ...], set[int]]:
-    """Starting poses, best-tied station first, and the points about which some pair of views disagreed."""
+def _placed(book: _Book) -> tuple[tuple[Pose, ...], dict[int, str]]:
+    """Starting poses, best-tied station first, and the points about which some pair of views disagreed, with what that
+    pair tells."""
     poses: dict[int, Pose] = {0: Pose.identity()}
     first = book.seen_by(0)
     known = dict(zip(first.names, zip(first.xyz_mm, first.cov_mm2, strict=True), strict=True))
-    doubtful: set[int] = set()
+    doubtful: dict[int, str] = {}
     while len(poses) < len(book.stations):
         left = [k for k in range(len(book.stations)) if k not in poses]
         common = {k: [n for n in book.seen_by(k).names if n in known] for k in left}
@@ -144,7 +151,10 @@ def _placed(book: _Book) -> tuple[tuple[Pose, ...], set[int]]:
         )
         view = book.seen_by(k)
         fit = locate_station(base, view, FitSettings(where=book.stations[k], false_alarm=_PLACING_ALARM))
-        doubtful |= {book.points.index(r.name) for r in fit.rejected if r.name in known}
+        for r in fit.rejected:
+            if r.name in known:
+                told = f" ({r.detail})" if r.reason in _TELLING else ""
+                doubtful.setdefault(book.points.index(r.name), told)
         poses[k] = fit.X_MN
         world = to_world(fit.X_MN, view)
         for name, xyz, cov in zip(world.names, world.xyz_mm, world.cov_mm2, strict=True):
@@ -155,29 +165,31 @@ def _placed(book: _Book) -> tuple[tuple[Pose, ...], set[int]]:
 class _Snooping:
     """Which observations stay: adjust, test, take the clearest case out, until all agree."""
 
-    def __init__(self, book: _Book, start: tuple[Pose, ...], doubtful: set[int], false_alarm: float) -> None:
+    def __init__(self, book: _Book, start: tuple[Pose, ...], doubtful: dict[int, str], false_alarm: float) -> None:
         self._book, self._poses, self._false_alarm = book, start, false_alarm
         self._used: NDArray[np.bool_] = np.ones(len(book.observations.point), dtype=np.bool_)
-        self._rejected = list(book.rejected)
         self._doubtful = doubtful
-        self._out: set[int] = set()
-        """Points of which an observation was put out."""
+        self._wrong: list[int] = []
+        """Rows whose point other views place elsewhere."""
+        self._undecided: list[Rejection] = []
+        self._unexplained: set[int] = set()
+        """Points of which an observation is out, and nothing tells why: swapped labels are no sign of small sigmas."""
 
     def run(self) -> Network:
         if self._doubtful:
             self._used &= ~np.isin(self._book.observations.point, sorted(self._doubtful))
             self._settle_doubtful(self._adjusted())
         allowed = max(len(self._book.stations), len(self._used) // 10)
-        while len(self._out) <= allowed:
+        while len(self._unexplained) <= allowed:
             adjusted = self._adjusted()
             worst = self._worst(adjusted)
             if worst is None:
                 return self._network(adjusted)
             self._put_out(worst, adjusted)
+        count, gone = len(self._book.points), len(self._unexplained)
+        names = ", ".join(self._book.points[j] for j in sorted(self._unexplained)[:8])
         cause = "observation after observation would have to go until the rest fits: sigmas too small, or moved targets"
-        raise NotCongruent(
-            "network", cause, value=len(self._book.points) - len(self._out), limit=len(self._book.points) - allowed
-        )
+        raise NotCongruent("network", f"{cause}; first {names}", value=count - gone, limit=count - allowed)
 
     def _adjusted(self) -> Adjusted:
         adjusted = adjust(self._book.observations.rows(self._used), self._poses, held=0)
@@ -200,9 +212,7 @@ class _Snooping:
             most = bits(largest_clique(adjacency(agree)))
             keep = most if 2 * len(most) > len(rows) else []
             self._used[rows[keep]] = True
-            away = np.linalg.norm(places - places[keep].mean(axis=0), axis=1) if keep else np.zeros(len(rows))
-            for i in sorted(set(range(len(rows))) - set(keep)):
-                self._reject(int(rows[i]), _told(float(away[i])) if keep else _told_undecided(places))
+            self._put_aside(rows[[i for i in range(len(rows)) if i not in keep]], bool(keep), places)
 
     def _worst(self, adjusted: Adjusted) -> int | None:
         """Row (among the used) with the largest statistic over its threshold, None when all agree."""
@@ -218,18 +228,42 @@ class _Snooping:
         used = np.flatnonzero(self._used)
         point = self._book.observations.point
         views = np.flatnonzero(point[used] == point[used[worst]])
-        if len(views) > 2:
-            self._reject(int(used[worst]), _told(float(np.linalg.norm(adjusted.residuals_mm[worst]))))
-            return
-        for row in used[views]:
-            self._reject(int(row), _told_undecided(adjusted.residuals_mm[views]))
+        decided = len(views) > 2
+        self._put_aside(used[[worst]] if decided else used[views], decided, adjusted.residuals_mm[views])
 
-    def _reject(self, row: int, why: tuple[str, str]) -> None:
-        self._used[row] = False
+    def _put_aside(self, rows: NDArray[np.intp], decided: bool, places_mm: Array) -> None:
+        """Rows of one point that are not used: wrong, or among views (v, 3) of which none can be called wrong."""
+        self._used[rows] = False
+        self._unexplained |= {j for j in self._book.observations.point[rows].tolist() if not self._doubtful.get(j)}
+        if decided:
+            self._wrong += rows.tolist()
+            return
+        apart = float(np.max(np.linalg.norm(places_mm[:, None] - places_mm[None, :], axis=2)))
+        detail = f"its {len(places_mm)} views are {apart:.3f} mm apart, and nothing tells which is wrong"
+        for row in rows.tolist():
+            told = self._doubtful.get(int(self._book.observations.point[row]), "")
+            self._undecided.append(Rejection(self._name(row), "undecided", detail + told))
+
+    def _name(self, row: int) -> str:
         observations = self._book.observations
-        self._out.add(int(observations.point[row]))
-        name = f"{self._book.stations[observations.station[row]]}: {self._book.points[observations.point[row]]}"
-        self._rejected.append(Rejection(name, *why))
+        return f"{self._book.stations[observations.station[row]]}: {self._book.points[observations.point[row]]}"
+
+    def _explained(self, adjusted: Adjusted) -> list[Rejection]:
+        """What each wrong observation is: its whole view is laid upon the adjusted points."""
+        observations, found = self._book.observations, list[Rejection]()
+        known = np.all(np.isfinite(adjusted.points_mm), axis=1)
+        for k in sorted({int(observations.station[row]) for row in self._wrong}):
+            rows = np.flatnonzero((observations.station == k) & known[observations.point])
+            point = observations.point[rows]
+            covs = adjusted.points_cov_mm2[point], observations.cov_mm2[rows]
+            names = tuple(self._book.points[j] for j in point)
+            pairs = Pairs(names, adjusted.points_mm[point], observations.xyz_mm[rows], *covs)
+            tolerance = pair_tolerance_mm(pairs.nominal_mm, pairs.measured_mm, covs, FitSettings())
+            out = [i for i, row in enumerate(rows) if row in self._wrong]
+            why = explain(pairs, adjusted.poses[k].inverse(), out, tolerance).rejected
+            found += [replace(r, name=f"{self._book.stations[k]}: {r.name}") for r in why]
+        lost = [row for row in self._wrong if not known[observations.point[row]]]
+        return found + [Rejection(self._name(row), "undecided", "its other views disagree too") for row in lost]
 
     def _network(self, adjusted: Adjusted) -> Network:
         book = self._book
@@ -247,17 +281,7 @@ class _Snooping:
             views=tuple(int(np.sum(kept.point == j)) for j in known),
             observed=tuple((book.stations[k], book.points[j]) for k, j in zip(kept.station, kept.point, strict=True)),
             residuals_mm=adjusted.residuals_mm,
-            rejected=tuple(self._rejected),
+            rejected=(*book.rejected, *self._explained(adjusted), *self._undecided),
             chi2=adjusted.chi2(),
             dof=3 * len(kept.point) - unknowns,
         )
-
-
-def _told(off_mm: float) -> tuple[str, str]:
-    return "mis-aimed", f"{off_mm:.3f} mm from where the other stations put it"
-
-
-def _told_undecided(places_mm: Array) -> tuple[str, str]:
-    """Views of which none can be called wrong: places or residuals (v, 3) in W."""
-    apart = float(np.max(np.linalg.norm(places_mm[:, None] - places_mm[None, :], axis=2)))
-    return "undecided", f"its {len(places_mm)} views are {apart:.3f} mm apart, and nothing tells which is wrong"

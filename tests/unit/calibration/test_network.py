@@ -144,6 +144,46 @@ def test_one_bad_observation_a_station_is_found_and_named(size: float) -> None:
     assert found.views[found.points.names.index("P12")] == 2
 
 
+def mixed_up(one: View, order: dict[str, str]) -> View:
+    """The view with its labels changed: what stands at a key is called as the value says."""
+    names = tuple(order.get(name, name) for name in one.readings.names)
+    return View(one.name, Points(names, one.readings.xyz_mm, one.readings.cov_mm2))
+
+
+TWO_PAIRS = {"P01": "P02", "P02": "P01", "P08": "P11", "P11": "P08"}
+
+
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_swapped_labels_of_one_station_are_named(which: int) -> None:
+    rng = np.random.default_rng(15)
+    views = [view(k, ALL, rng) for k in range(3)]
+    views[which] = mixed_up(views[which], TWO_PAIRS)
+    found = adjust_network(tuple(views), None)
+    told = {(r.name, r.reason, r.partner) for r in found.rejected}
+    assert told == {(f"{'ABC'[which]}: {name}", "swapped", TWO_PAIRS[name]) for name in TWO_PAIRS}
+    assert found.consistent
+
+
+def test_labels_swapped_in_one_of_two_views_are_told_though_not_whose() -> None:
+    rng = np.random.default_rng(16)
+    views = view(0, ALL, rng), mixed_up(view(1, ALL, rng), {"P03": "P07", "P07": "P03"})
+    found = adjust_network(views, None)
+    assert {r.name for r in found.rejected} == {f"{k}: {name}" for k in "AB" for name in ("P03", "P07")}
+    for r in found.rejected:
+        other = "P07" if r.name.endswith("P03") else "P03"
+        assert (r.reason, r.detail.partition("(")[2]) == ("undecided", f"swapped with {other})")
+
+
+def test_a_reading_in_another_unit_is_named() -> None:
+    rng = np.random.default_rng(17)
+    views = [view(k, ALL, rng) for k in range(3)]
+    xyz = views[2].readings.xyz_mm.copy()
+    xyz[5] /= 25.4
+    views[2] = View("C", Points(NAMES, xyz, views[2].readings.cov_mm2))
+    (r,) = adjust_network(tuple(views), None).rejected
+    assert (r.name, r.reason) == ("C: P06", "unit-mix-up")
+
+
 def test_a_reference_that_has_moved_is_found() -> None:
     rng = np.random.default_rng(10)
     ers = references(rng)
