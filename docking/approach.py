@@ -1,8 +1,8 @@
 """Where the component should be at each station, and how far its docking features are from there.
 
 The features' goal is the mate's features; a station's goal stands its stand-off back along the docking axis. Errors are
-always component minus goal in W, judged with the uncertainty of both sides (design rule 11 of the acceptance: every
-e + 2 sigma inside its tolerance, ISO 14253-1).
+always component minus goal in W, judged with the uncertainty of both sides (docs/decisions/0007: every e + 2 sigma
+inside its tolerance, ISO 14253-1).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""RC-1 and RC-3 as the domain page describes them, built from its numbers, not from the cell files."""
+"""RC-1 and RC-3 as docs/mechanics.md describes them, built from its numbers, not from the cell files."""
 
 from __future__ import annotations
 

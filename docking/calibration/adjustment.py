@@ -1,9 +1,9 @@
 """Least-squares adjustment of several stations over the points that they share.
 
 Unknown are the poses X_k of the stations in W and the points p_j; an observation z of point j from station k has the
-covariance S_k in the station's frame. Minimised is `sum e^T (R_k S R_k^T)^-1 e`, e = X_k z - p_j (numerics C, extended
-by the points). Given the poses each point is the weighted mean of what the stations say, so only the poses are solved
-for (Schur complement); the points and their covariance follow.
+covariance S_k in the station's frame. Minimised is `sum e^T (R_k S R_k^T)^-1 e`, e = X_k z - p_j (docs/fit.md (11) to
+(13)). Given the poses each point is the weighted mean of what the stations say, so only the poses are solved for (Schur
+complement); the points and their covariance follow.
 """
 
 from __future__ import annotations

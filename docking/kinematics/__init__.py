@@ -1,4 +1,4 @@
-"""Pose of the component <-> ball centres <-> axis displacements; consistency and forces. Domain 4."""
+"""Pose of the component <-> ball centres <-> axis displacements; consistency and forces. docs/mechanics.md."""
 
 from docking.kinematics.forces import (
     Load,

@@ -1,4 +1,4 @@
-"""Forces at the balls: reactions under gravity, internal force, warp. Domain 4, equation (11).
+"""Forces at the balls: reactions under gravity, internal force, warp. docs/mechanics.md (16) to (22).
 
 A driven axis is a spring along itself; a passive axis carries nothing; a force-controlled follower exerts the force it
 holds, wherever the component takes it. Forces are what the sockets exert on the component.
@@ -122,7 +122,7 @@ def sink_mm(positioners: Positioners, reactions_n: ArrayLike) -> Array:
 
 
 def consistency_projector(balls_W_mm: ArrayLike) -> Array:
-    """N = I - J J^+ (3k, 3k): the part of ball displacements that no rigid motion explains; equation (9)."""
+    """N = I - J J^+ (3k, 3k): the part of ball displacements that no rigid motion explains; equation (12)."""
     balls = np.asarray(balls_W_mm, dtype=np.float64)
     centre = balls.mean(axis=0)
     jac = ball_jacobian(balls, centre).reshape(-1, 6)
@@ -146,7 +146,7 @@ def internal_force_matrix(positioners: Positioners, balls_W_mm: ArrayLike) -> Ar
 
 
 def internal_forces_n(forces_W_n: ArrayLike, reactions_n: ArrayLike) -> Array:
-    """Internal force (k, 3): measured ball forces less the reactions that equilibrium needs; equation (11)."""
+    """Internal force (k, 3): measured ball forces less the reactions that equilibrium needs; equation (21)."""
     result: Array = np.asarray(forces_W_n, dtype=np.float64) - np.asarray(reactions_n, dtype=np.float64)
     return result
 

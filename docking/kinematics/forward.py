@@ -1,4 +1,4 @@
-"""From axis positions to the pose of the component, and what fits no rigid body. Domain 4, equations (8), (9)."""
+"""From axis positions to the pose of the component, and what fits no rigid body. docs/mechanics.md (10), (11)."""
 
 from __future__ import annotations
 
@@ -46,6 +46,6 @@ def pose_from_axes(positioners: Positioners, q_mm: ArrayLike, rows: NDArray[np.b
 
 
 def figure_residual_mm(positioners: Positioners, q_mm: ArrayLike, X_WC: Pose) -> Array:
-    """Socket less ball, e_i = o_i + A_i q_i - X_WC b_i (k, 3); equation (9)."""
+    """Socket less ball, e_i = o_i + A_i q_i - X_WC b_i (k, 3); equation (11)."""
     result: Array = socket_positions(positioners, q_mm) - X_WC.apply(positioners.balls_C_mm)
     return result

@@ -30,7 +30,7 @@ class Coupling(NamedTuple):
 
 
 class CouplingMonitor:
-    """What axis deviations `dq = q_actual - q_planned` (m,) mean, to first order; equations (9), (10), (11).
+    """What axis deviations `dq = q_actual - q_planned` (m,) mean, to first order; docs/mechanics.md (13) to (15), (20).
 
     Residual `r = N A dq` over driven and passive axes; internal force `F = G dq` over the driven axes only; warp is
     `row F`. NaN in any axis makes all figures NaN, so a limit written `not value <= limit` trips.
@@ -119,7 +119,7 @@ def pose_step_matrix(positioners: Positioners, balls_W_mm: Array) -> Array:
 
 
 def _passive_rows(positioners: Positioners, balls_W_mm: Array) -> Array:
-    """(m, m): each axis less where the driven axes' read-backs take the component; equation (10)."""
+    """(m, m): each axis less where the driven axes' read-backs take the component; equation (15)."""
     jac = axis_jacobian(positioners, balls_W_mm, balls_W_mm.mean(axis=0))
     result: Array = np.eye(len(jac)) - jac @ pose_step_matrix(positioners, balls_W_mm)
     return result

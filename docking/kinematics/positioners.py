@@ -1,7 +1,7 @@
 """Geometry of a set of three-axis positioners that carry one component on ball joints.
 
-Domain 4, equations (2) to (4) and (7). k positioners with three axes each: m = 3 k, axis index 3 i + j. The socket of
-positioner i stands at `p_i = o_i + A_i q_i`; the columns of A_i are the real axis directions times their scale.
+docs/mechanics.md (2) to (5), (8) and (9). k positioners with three axes each: m = 3 k, axis index 3 i + j. The socket
+of positioner i stands at `p_i = o_i + A_i q_i`; the columns of A_i are the real axis directions times their scale.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def axis_positions(positioners: Positioners, sockets_W_mm: ArrayLike) -> Array:
 
 
 def axis_displacements(positioners: Positioners, shifts_W_mm: ArrayLike) -> Array:
-    """Axis displacements (..., m) that move the sockets by `shifts_W_mm` (..., k, 3); equation (4), relative."""
+    """Axis displacements (..., m) that move the sockets by `shifts_W_mm` (..., k, 3); equation (5), relative."""
     shifts = np.asarray(shifts_W_mm, dtype=np.float64)
     result: Array = np.einsum("kij,...kj->...ki", positioners.axes_inverse, shifts)
     return result.reshape(*shifts.shape[:-2], -1)
@@ -114,7 +114,7 @@ def ball_jacobian(balls_W_mm: ArrayLike, centre_W_mm: ArrayLike) -> Array:
 
 
 def axis_jacobian(positioners: Positioners, balls_W_mm: ArrayLike, centre_W_mm: ArrayLike) -> Array:
-    """Axis displacements per twist about `centre_W_mm` (m, 6): row k is a_k^T [I, -[p_i - c]x]; equation (7)."""
+    """Axis displacements per twist about `centre_W_mm` (m, 6): row k is a_k^T [I, -[p_i - c]x]; equation (8)."""
     result: Array = (positioners.axes_inverse @ ball_jacobian(balls_W_mm, centre_W_mm)).reshape(-1, 6)
     return result
 

@@ -1,4 +1,4 @@
-"""From a correction to a checked table of axis positions. Domain 5."""
+"""From a correction to a checked table of axis positions. docs/mechanics.md (27) to (53)."""
 
 from docking.planning.correction import (
     Action,

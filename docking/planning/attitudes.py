@@ -1,4 +1,7 @@
-"""Ball swivel and ball reactions along a path, all samples at once: the attitude of the component decides both."""
+"""Ball swivel and ball reactions along a path, all samples at once: the attitude of the component decides both.
+
+docs/mechanics.md (18), (19).
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """From where the component is and where it should be to the move that is asked, and whether to ask for one at all.
 
-Domain 4 equation (6) and 5.7. Correction = goal times measured^-1, told about the centre of the docking face: about a
-distant origin a small rotation would read as a large shift.
+docs/mechanics.md (27) to (29), (49) and (50). Correction = goal times measured^-1, told about the centre of the docking
+face: about a distant origin a small rotation would read as a large shift.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def correction_to(X_WC: Pose, X_WG: Pose, pivot_C_mm: ArrayLike) -> Correction:
 
 
 def displaced(correction: Correction, points_W_mm: ArrayLike) -> Array:
-    """Points (..., 3) of the component in W after the correction: c + shift + dR (p - c); equation (5)."""
+    """Points (..., 3) of the component in W after the correction: c + shift + dR (p - c); equation (28)."""
     arm = np.asarray(points_W_mm, dtype=np.float64) - correction.pivot_W_mm
     result: Array = arm @ exp_so3(correction.rotvec_rad).T + correction.pivot_W_mm + correction.shift_mm
     return result
@@ -131,7 +131,7 @@ class Verdict:
 
 
 def decide(history: Sequence[Attempt], settings: ConvergenceSettings, stage: str = "station") -> Verdict:
-    """What to do after the last of `history` (at least one attempt, oldest first); domain 5.7.
+    """What to do after the last of `history` (at least one attempt, oldest first); equation (50).
 
     An error counts as worse only when it grew by more than its sigma: the noise floor makes small errors wander.
     An error inside its sigma is measured more before it is moved for, as long as passes are left.

@@ -1,12 +1,13 @@
 """What one axis that jams, or stops by itself, does to the part before the others have stopped: a bound on the speed.
 
-Axis k jams at its speed v. It is seen when it hangs back by `stuck`, the others go on for the reaction time r and then
-ramp down together in t: `d = stuck + v r + v t / 2`, t = max_i v_i / a_quick,i, so that `v t / 2 = v^2 / (2 a_quick)`
-for the fastest axis. Each mm of it costs `c` mm at the worst ball (column of N A), `G` newton there (column of the
-internal-force matrix) and `W` newton of warp. An axis that ramps down as fast as the others parts by v r only.
+docs/mechanics.md (42) to (44). Axis k jams at its speed v. It is seen when it hangs back by `stuck`, the others go on
+for the reaction time r and then ramp down together in t: `d = stuck + v r + v t / 2`, t = max_i v_i / a_quick,i, so
+that `v t / 2 = v^2 / (2 a_quick)` for the fastest axis. Each mm of it costs `c` mm at the worst ball (column of N A),
+`G` newton there (column of the internal-force matrix) and `W` newton of warp. An axis that ramps down as fast as the
+others parts by v r only.
 
 An axis that holds a force has no set-point to hang back from. Jammed, it holds a position: its force leaves its
-tolerance after `tolerance / G_kk` mm, which two readings of its load cell in a row must show; where the plan takes it
+tolerance after `tolerance / G` mm, which two readings of its load cell in a row must show; where the plan takes it
 by `seen_mm` in the window of the encoders or faster, they show it first. The slower of the two has the longer way.
 """
 

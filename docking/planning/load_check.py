@@ -1,7 +1,8 @@
-"""Is the part on the balls the part of the job? Mass, centre of mass and warp from the load cells. Domain 4 (11).
+"""Is the part on the balls the part of the job? Mass, centre of mass and warp from the load cells.
 
-The sockets' forces F at the balls p hold the weight: `m g = sum F . up`, and with `M = sum p x F` the centre of mass
-stands at `up x M / (m g)` across the vertical. Its height does not show while the part stands still.
+docs/mechanics.md (23). The sockets' forces F at the balls p hold the weight: `m g = sum F . up`, and with
+`M = sum p x F` the centre of mass stands at `up x M / (m g)` across the vertical. Its height does not show while the
+part stands still.
 """
 
 from __future__ import annotations

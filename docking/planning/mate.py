@@ -1,6 +1,6 @@
 """The way to the mate: clearance of the whole move, the corridor of the insertion, the order of the stations.
 
-Domain 5.6, 5.8; faults PLN-03. The gap g of a pose is how far the docking face stands before its docked place along the
+docs/mechanics.md (45) to (48). The gap g of a pose is how far the docking face stands before its docked place along the
 insertion axis. What the drives do when they miss their SYNC is part of the move: from every sample they may go straight
 on at their speed for `coast_s` and half the common ramp.
 """

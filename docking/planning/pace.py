@@ -1,4 +1,4 @@
-"""How fast one rigid path may be run: the shortest time law inside all limits. Domain 5.2-5.4.
+"""How fast one rigid path may be run: the shortest time law inside all limits. docs/mechanics.md (35) to (38).
 
 Along the path `q' = g s'`, `q'' = g s'' + h s'^2`, `q''' = g s''' + 3 h s' s'' + l s'^3`.
 """

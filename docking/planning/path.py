@@ -1,8 +1,8 @@
 """The path of one move: a rigid motion of the commanded socket figure along a scalar s in 0..1.
 
-Domain 5.1: `R(s) = exp(s w) R0`, the pivot c travels straight by `shift`. A socket at arm r from the pivot goes
-`p(s) = p0 + s shift + (cos(theta s) - 1) r_perp + sin(theta s) (u x r)`, u = w / theta. So each axis is a combination
-of three functions of s, and the whole table one product (n, 3) @ (3, m).
+docs/mechanics.md (30) to (32): `R(s) = exp(s w) R0`, the pivot c travels straight by `shift`. A socket at arm r from
+the pivot goes `p(s) = p0 + s shift + (cos(theta s) - 1) r_perp + sin(theta s) (u x r)`, u = w / theta. So each axis is
+a combination of three functions of s, and the whole table one product (n, 3) @ (3, m).
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class RigidPath:
         return result
 
     def axis_derivative(self, s: Array, order: int) -> Array:
-        """d^order q / ds^order (n, m): g_k, h_k of domain 5.1 for order 1, 2."""
+        """d^order q / ds^order (n, m): g, h, l of docs/mechanics.md (32)."""
         result: Array = _basis(s, self.angle_rad, order) @ self.axis_rows
         return result
 

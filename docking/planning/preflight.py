@@ -1,6 +1,7 @@
 """The check of a whole move before its first command: every axis, driven and passive, at every point of the path.
 
-Domain 5.3, 5.8; faults 4.3. Each refusal names the axis, where on the path (s), the value and the limit.
+docs/mechanics.md (38), (39) and what follows (41). Each refusal names the axis, where on the path (s), the value and
+the limit.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ def check_table(s: Array, q_mm: Array, period_s: float, positioners: Positioners
 
 
 def chord_error_mm(path: RigidPath, s: Array) -> float:
-    """L theta^2 / 8 of the largest turn between two rows of the table (domain 5.3)."""
+    """L theta^2 / 8 of the largest turn between two rows of the table; docs/mechanics.md (38)."""
     turn = path.angle_rad * float(np.max(np.diff(s)))
     return path.spread_mm * turn * turn / 8.0
 

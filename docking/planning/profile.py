@@ -1,8 +1,9 @@
 """Straight pieces of a plan for drives that go to a target by their own ramps (profile position).
 
-Speeds, accelerations and decelerations in the proportion of the ways keep all axes at one fraction of a piece at any
-time, on the way, while ramping and in a halt: the axes trace a straight line from rest to rest. What is left is how far
-the rigid path bends away from it, what the drives' whole counts round, and how far apart they begin.
+docs/mechanics.md (41). Speeds, accelerations and decelerations in the proportion of the ways keep all axes at one
+fraction of a piece at any time, on the way, while ramping and in a halt: the axes trace a straight line from rest to
+rest. What is left is how far the rigid path bends away from it, what the drives' whole counts round, and how far apart
+they begin.
 """
 
 from __future__ import annotations

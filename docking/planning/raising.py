@@ -1,4 +1,4 @@
-"""The first waypoints of a path: lift the component off its seat, bring it level. Domain 5.6.
+"""The first waypoints of a path: lift the component off its seat, bring it level. docs/mechanics.md (51) to (53).
 
 Level is as level as docked by design: gravity then pulls on the component along the same direction in C as
 when docked. The shortest rotation leads there, so that the heading stays.

@@ -1,7 +1,7 @@
 """Taking internal force out of a part that a stop has left strained: what the load cells say of it, and the next step.
 
-Domain 4 equation (11). Along the axes the internal force is the part of the measured forces that is in equilibrium with
-itself, `f_int = (I - K J (J^T K J)^-1 J^T) f`: the weight drops out of it. Moving the driven axes by
+docs/mechanics.md (25), (26). Along the axes the internal force is the part of the measured forces that is in
+equilibrium with itself, `f_int = (I - K J (J^T K J)^-1 J^T) f`: the weight drops out of it. Moving the driven axes by
 `dq = -K^-1 f_int` is the gradient of the strain energy and takes away just this force: `J^T K dq = 0`, so that the
 component, and every axis that only follows it, stays where it is.
 """
@@ -333,7 +333,7 @@ def _check_ends(request: StepRequest, positioners: Positioners, margin_mm: float
 def _duration_s(
     travel_mm: Array, positioners: Positioners, settings: PlanSettings, speed_mm_s: float
 ) -> tuple[float, str]:
-    """Shortest quintic within the speed of a relief and the limits of every axis; domain 5.2."""
+    """Shortest quintic within the speed of a relief and the limits of every axis; docs/mechanics.md (33)."""
     share = settings.acceleration_share
     acceleration = np.sqrt(_ACCELERATION_PEAK * travel_mm / (share * positioners.a_mm_s2))
     jerk = _JERK_ROOM * np.cbrt(_JERK_PEAK * travel_mm / positioners.j_mm_s3)

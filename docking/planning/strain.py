@@ -1,8 +1,8 @@
 """What the devices add to a rigid plan by themselves: straight interpolation between rows, different starts and clocks.
 
-Domain 5.3, 5.4. Between two rows the axes go straight while the rigid figure bends: the part is squeezed by what no
-rigid motion explains of the difference. Positioner i that starts dt_i late is v_i dt_i behind; with all starts within
-the skew, the worst that the positioners can do together is half the sum of what each does alone.
+docs/mechanics.md (40). Between two rows the axes go straight while the rigid figure bends: the part is squeezed by what
+no rigid motion explains of the difference. Positioner i that starts dt_i late is v_i dt_i behind; with all starts
+within the skew, the worst that the positioners can do together is half the sum of what each does alone.
 """
 
 from __future__ import annotations

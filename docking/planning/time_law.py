@@ -1,4 +1,4 @@
-"""One scalar s(t), 0 to 1, for all axes: quintic, or seven segments of constant jerk. Domain 5.2.
+"""One scalar s(t), 0 to 1, for all axes: quintic, or seven segments of constant jerk. docs/mechanics.md (33), (34).
 
 A law is a piecewise polynomial in u = t / T. Stretching T scales s', s'', s''' by 1/T, 1/T^2, 1/T^3 exactly, so the
 shortest T of one shape follows from its peaks in one step.

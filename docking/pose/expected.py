@@ -1,9 +1,9 @@
 """What a layout of points will give before any of them is measured: the covariance of the pose and of docking features,
 the part that each point plays, and what one more point would bring.
 
-All follows from the normal matrix of the weighted fit (numerics C): `N = sum A_i^T S_i^-1 A_i + L`, cov = N^-1, with
-A_i the design of point i, S_i its covariance (reading and nominal together) and L the prior of the expansion. Another
-point adds its own term, a point left out takes its term away.
+All follows from the normal matrix of the weighted fit (docs/fit.md (4)): `N = sum A_i^T S_i^-1 A_i + L`, cov = N^-1,
+with A_i the design of point i, S_i its covariance (reading and nominal together) and L the prior of the expansion.
+Another point adds its own term, a point left out takes its term away.
 """
 
 from __future__ import annotations

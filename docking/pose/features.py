@@ -1,6 +1,6 @@
 """Docking features: how far component and mate are apart, how well that is known, and where the component must go.
 
-Design rule 11: sigma of a feature holds component fit, mate fit, drift since the last reference check, the nominal
+docs/decisions/0007: sigma of a feature holds component fit, mate fit, drift since the last reference check, the nominal
 covariance of the features on both sides, and temperature; the largest eigenvalue counts. A missing sigma refuses.
 """
 

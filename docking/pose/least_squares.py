@@ -1,7 +1,7 @@
 """Least-squares rigid fits, [Luo] method 3: equal weights over Euler angles, and maximum likelihood on SE(3).
 
 With equal weights the minimum is the one `fit_svd` gives in closed form. With covariances the fit is the
-maximum-likelihood estimate and reaches the Cramer-Rao bound, which no unweighted method does (numerics C).
+maximum-likelihood estimate and reaches the Cramer-Rao bound, which no unweighted method does (docs/fit.md (1) to (8)).
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def normal_equations(
 def fit_maximum_likelihood(
     nominal_mm: Array, measured_mm: Array, covs_mm2: tuple[Array, Array], start: Pose, expansion_sigma: float = 0.0
 ) -> Solution:
-    """Maximum-likelihood pose (numerics C): minimises `sum r^T S^-1 r (+ (e / sigma_e)^2)`, r = P - (R J + T).
+    """Maximum-likelihood pose (docs/fit.md (2)): minimises `sum r^T S^-1 r (+ (e / sigma_e)^2)`, r = P - (R J + T).
 
     `covs_mm2` = (nominal in N, measured in M), each (n, 3, 3); S_i = S_Pi + R S_Ji R^T follows the rotation. Steps are
     Gauss-Newton on the manifold about the weighted centroid c of the measured points; with `expansion_sigma` > 0 a

@@ -3,9 +3,9 @@
 A reading at distance d has the standard deviations
     range       sqrt( (range + range_per_mm d)^2 + offset^2 )
     transverse  transverse + transverse_per_mm d
-and the covariance `u u^T s_r^2 + (I - u u^T) s_t^2`, u = unit line of sight, which equals numerics C's
-`R_dir diag(sr^2, st^2, st^2) R_dir^T`. A reflector never sits twice at the same place: its repeatability in the nest
-adds `seating^2 I`.
+and the covariance `u u^T s_r^2 + (I - u u^T) s_t^2`, u = unit line of sight, which is `diag(s_r^2, s_t^2, s_t^2)`
+turned so that its first axis is u (docs/fit.md (9), (10)). A reflector never sits twice at the same place: its
+repeatability in the nest adds `seating^2 I`.
 """
 
 from __future__ import annotations
@@ -70,9 +70,9 @@ class NoiseModel:
 
 
 LASER_TRACKER = NoiseModel(0.005, 0.15e-6, 0.0075, 3.0e-6, 0.0025)
-"""Leica AT500 class, sigma = MPE / 2: ADM 10 um + 0.3 um/m, R0 5 um, transverse 15 um + 6 um/m (domain 3)."""
+"""Leica AT500 class (user manual, p. 39), sigma = MPE / 2: ADM 10 um + 0.3 um/m, R0 5 um, transverse 15 um + 6 um/m."""
 
 TOTAL_STATION = NoiseModel(0.6, 1.0e-6, 0.05, 4.85e-6)
-"""Survey class: distance 0.6 mm + 1 ppm, directions 1 arcsec, 0.05 mm of centring (domain 3)."""
+"""Survey class: distance 0.6 mm + 1 ppm, directions 1 arcsec, 0.05 mm of centring; docs/fit.md."""
 
 NOISE_PRESETS: dict[str, NoiseModel] = {"laser-tracker": LASER_TRACKER, "total-station": TOTAL_STATION}

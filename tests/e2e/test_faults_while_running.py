@@ -131,7 +131,7 @@ def test_a_jammed_axis_stops_all_on_the_path(name, share, axis, tmp_path):
         sent = table[times < closing_s]
         assert run.figure_gap_mm(sent, plan).max() <= 0.002
         assert path_gap_mm(plan.q_mm, np.unique(sent, axis=0)).max() <= 0.002
-        # Domain 3: what the limit lets pass, three cycles to react, then a stop on the path at a_quick, eased by half.
+        # docs/mechanics.md (42): what the limit lets pass, three cycles to react, a stop at a_quick, eased by half.
         v_mm_s, a_quick = np.abs(np.diff(plan.q_mm, axis=0)).max() / plan.period_s, 200.0
         further_mm = v_mm_s * 0.03 + 1.5 * v_mm_s**2 / (2.0 * a_quick)
         assert 20.0 < max(forces) <= run.cell.limits.internal_force_n + 0.69 * 2000.0 * further_mm

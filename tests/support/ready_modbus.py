@@ -153,7 +153,7 @@ class ReadyModbus:
         return float(self.record.figure_gap_mm(motor[t_s <= self.watched_until_s], motor[0]).max())
 
     def stated_mm(self) -> float:
-        """Chord error and what start skew and clocks may part at the plan's peak speed; domain 5.3 and 5.4."""
+        """Chord error and what start skew and clocks may part at peak speed; docs/mechanics.md (37), (38)."""
         bus, plan = self.cell.bus, self.plan
         speed = float(np.abs(np.diff(plan.q_mm, axis=0)).max()) / plan.period_s
         parted_s = bus.start_skew_s + 2e-6 * bus.clock_ppm * plan.duration_s  # type: ignore[union-attr]

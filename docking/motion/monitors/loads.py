@@ -1,4 +1,4 @@
-"""What the load cells show against what mass, centre of mass and attitude let expect. Domain 4, equation (11)."""
+"""What the load cells show against what mass, centre of mass and attitude let expect. docs/mechanics.md (24)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """How near the estimators come to the Cramer-Rao bound on a laser tracker's noise; is the stated covariance honest?
 
-The bound of a point x is `A_x N^-1 A_x^T`, `N = sum A_i^T S_i^-1 A_i` (numerics C): no unbiased estimator is better.
+The bound of a point x is `A_x N^-1 A_x^T`, `N = sum A_i^T S_i^-1 A_i`: no unbiased estimator is better;
+docs/fit.md (6).
 """
 
 from __future__ import annotations

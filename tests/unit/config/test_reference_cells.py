@@ -1,4 +1,4 @@
-"""The seven reference cells load, check clean and are what domain 3 says."""
+"""The seven reference cells load, check clean and are what docs/mechanics.md says."""
 
 from itertools import combinations
 from pathlib import Path
@@ -89,7 +89,7 @@ def test_tracker_stands_outside_and_sees_the_side_of_the_targets(name: str) -> N
 
 
 def test_fuselage_reactions_are_those_of_the_reference() -> None:
-    """A 10.1 B 16.0 C 19.3 D 13.4 kN (domain 3)."""
+    """A 10.1 B 16.0 C 19.3 D 13.4 kN (docs/mechanics.md, RC-1)."""
     cell, job = load("fuselage-can")
     positioners, load_on = positioners_from(cell, job), load_from(cell, job)
     docked = docked_pose(cell, job)

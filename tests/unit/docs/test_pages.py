@@ -29,6 +29,34 @@ def test_paths_in_code_marks_exist(page: Path) -> None:
         assert "NAME" in named or (ROOT / named).exists(), named
 
 
+SOURCES = sorted(path for room in ("docking", "drivers", "sim", "tests") for path in (ROOT / room).rglob("*.py"))
+CITED = re.compile(r"docs/([\w-]+)\.md((?:(?:,| to| and|\s)\s*\(\d+\))*)")
+
+
+def equations(page: str) -> list[int]:
+    """Numbers of a page's equations: at the beginning of a line of mathematics, a cell or a code mark."""
+    text = (ROOT / "docs" / page).read_text("utf-8")
+    return [int(n) for n in re.findall(r"(?:^    |\| |`)\((\d+)\) (?!\|$)", text, re.MULTILINE)]
+
+
+@pytest.mark.parametrize("page", ["mechanics.md", "fit.md"])
+def test_equations_are_numbered_once_and_in_order(page: str) -> None:
+    numbers = equations(page)
+    assert len(numbers) > 10
+    assert numbers == list(range(1, len(numbers) + 1))
+
+
+def test_pages_and_equations_that_the_code_cites_exist() -> None:
+    cited = 0
+    for path in SOURCES:
+        for page, listed in CITED.findall(path.read_text("utf-8")):
+            assert (ROOT / "docs" / f"{page}.md").exists(), (path, page)
+            numbers = {int(n) for n in re.findall(r"\d+", listed)}
+            assert not numbers or numbers <= set(equations(f"{page}.md")), (path, page, numbers)
+            cited += len(numbers)
+    assert cited > 50
+
+
 def test_the_recipe_for_checking_a_journal_accepts_a_journal_and_refuses_a_changed_one(tmp_path: Path) -> None:
     page = (ROOT / "docs" / "journal.md").read_text("utf-8")
     found = re.search(r"^    import hashlib.*?(?=^\S)", page, re.DOTALL | re.MULTILINE)

@@ -1,4 +1,4 @@
-"""Reactions, internal forces, warp: the figures of domain 3 and 4."""
+"""Reactions, internal forces, warp: the figures of docs/mechanics.md."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def uneven(seed: int, rng: np.random.Generator) -> Positioners:
     return replace(rc1(crooked_axes(seed), driven=rc3().driven), stiffness_n_per_mm=stiffness)
 
 
-def test_rc1_reactions_of_the_domain_page() -> None:
+def test_rc1_reactions_are_those_of_the_reference() -> None:
     up = ball_reactions_n(rc1(), BALLS, LOAD.com_C_mm, WEIGHT)[0, :, 2]
     np.testing.assert_allclose(up / 1000.0, [10.1, 16.0, 19.3, 13.4], atol=0.06)
     centred = ball_reactions_n(rc1(), BALLS, np.zeros(3), WEIGHT)[0]
@@ -84,7 +84,7 @@ def test_balls_sink_by_their_load_over_the_stiffness() -> None:
     np.testing.assert_allclose(sink[:, :2], 0.0, atol=1e-9)
 
 
-def test_single_axis_errors_show_as_the_domain_page_says() -> None:
+def test_single_axis_errors_show_in_part() -> None:
     """0.83 in X, 0.75 in Y, 0.50 in Z of themselves, and only a quarter of a Z error at each ball."""
     N = consistency_projector(BALLS)
     assert [np.linalg.norm(N[:, k]) for k in range(3)] == pytest.approx([0.83, 0.75, 0.50], abs=0.005)

@@ -1,4 +1,4 @@
-"""Axis positions -> pose: domain 4, equations (8), (9)."""
+"""Axis positions -> pose: docs/mechanics.md (10), (11)."""
 
 from __future__ import annotations
 

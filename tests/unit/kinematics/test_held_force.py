@@ -33,7 +33,7 @@ def up_n(positioners: Positioners, com_mm: list[float]) -> np.ndarray:
 
 
 def test_reactions_are_those_of_four_carrying_axes() -> None:
-    """A 10.1 B 16.0 C 19.3 D 13.4 kN (domain 3), and without the force the part nearly tips: 23.5, 2.6, 32.7, 0."""
+    """A 10.1 B 16.0 C 19.3 D 13.4 kN, and without the force the part nearly tips: 23.5, 2.6, 32.7, 0."""
     assert_allclose(up_n(follower(), [600.0, 200.0, 0.0]), [10136.0, 16018.0, 19286.0, 13400.0], atol=5.0)
     free = up_n(rc3(d_z_driven=False), [600.0, 200.0, 0.0])
     assert_allclose(free / 1000.0, [23.5, 2.6, 32.7, 0.0], atol=0.05)

@@ -1,4 +1,4 @@
-"""Sockets, axes, Jacobian and rank: domain 4, equations (3), (4), (7)."""
+"""Sockets, axes, Jacobian and rank: docs/mechanics.md (3) to (5), (8), (9)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Correction, guard and the convergence loop: domain 4 (6), 5.6, 5.7."""
+"""Correction, guard and the convergence loop: docs/mechanics.md (27) to (29), (49), (50)."""
 
 from __future__ import annotations
 

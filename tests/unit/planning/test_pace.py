@@ -1,4 +1,4 @@
-"""How each limit sets the pace: domain 5.2, and turns so large that the curvature of the path counts."""
+"""How each limit sets the pace: docs/mechanics.md (36), and turns so large that the curvature of the path counts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The SE(3) path: domain 5.1, 5.3."""
+"""The SE(3) path: docs/mechanics.md (30) to (32), (38), (39)."""
 
 from __future__ import annotations
 

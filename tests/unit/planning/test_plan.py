@@ -1,4 +1,4 @@
-"""Whole plans: limits on the emitted set-points, rigidity, refusals. Domain 5, faults 4.3."""
+"""Whole plans: limits on the emitted set-points, rigidity, refusals. docs/mechanics.md, sections 9 to 13."""
 
 from __future__ import annotations
 

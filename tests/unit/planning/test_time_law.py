@@ -1,4 +1,4 @@
-"""The scalar law s(t): domain 5.2."""
+"""The scalar law s(t): docs/mechanics.md (33), (34)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def peaks(law: TimeLaw) -> np.ndarray:
     return result
 
 
-def test_quintic_peaks_are_those_of_the_domain_page() -> None:
+def test_quintic_peaks_are_those_of_its_derivatives() -> None:
     """s' 15/8, s'' 10/sqrt(3) = 5.7735, s''' 60, all at T = 1; and scaled by powers of T."""
     assert peaks(quintic())[1:] == pytest.approx([1.875, 5.7735, 60.0], rel=1e-5)
     assert peaks(quintic(2.0))[1:] == pytest.approx([1.875 / 2, 5.7735 / 4, 60.0 / 8], rel=1e-5)

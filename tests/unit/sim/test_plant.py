@@ -112,7 +112,7 @@ def test_one_axis_off_by_a_tenth(site, driver, name, force_n):
     before = plant.true_axis_forces_n()
     drive.move(axis(plant, name, np.sign(force_n) * 0.1))
     change = plant.true_axis_forces_n() - before
-    # 6 %: the share of Y depends on the height of the balls, figures of the domain carry two digits.
+    # 6 %: the share of Y depends on the height of the balls, figures of docs/mechanics.md carry two digits.
     assert change[plant.axes.index(name)] == pytest.approx(force_n, rel=0.06)
     if name.endswith("Z"):
         warp = change[2::3] @ (1, -1, 1, -1) / 4

@@ -1,4 +1,4 @@
-"""The truth files carry the main-study magnitudes of the domain; errors are named, switchable, independent."""
+"""The truth files carry the magnitudes of the main study; errors are named, switchable, independent."""
 
 from __future__ import annotations
 
