@@ -445,6 +445,10 @@ class FontMissing(ConfigError):
     code = 4013
 
 
+class BadMarkerFile(ConfigError):
+    code = 4014
+
+
 class BadRecording(ConfigError):
     code = 4021
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from docking.errors import BadPointFile, ConfigInvalid, FileUnreadable
+from docking.errors import BadMarkerFile, ConfigInvalid, FileUnreadable
 from docking.guidance.types import Camera, MarkerLayout
 
 CIRCLES = 4
@@ -65,25 +65,25 @@ def read_layout(path: Path) -> MarkerLayout:
     """Measured circle centres: `marker_id,circle,x_mm,y_mm,z_mm[,sx_mm,sy_mm,sz_mm]`, four rows a marker.
 
     A comment line states the marker itself: `# DICT_4X4_50, ArUco side 50 mm, circles radius 9 mm at (+-42, +-42) mm`.
-    Raises FileUnreadable, BadPointFile (line and column named).
+    Raises FileUnreadable, BadMarkerFile (line and column named).
     """
     comments, rows = _rows(path)
     header = _HEADER.search(" ".join(comments))
     if header is None:
         cause = "a comment must say: DICT_..., ArUco side S mm, circles radius R mm at (+-O, +-O) mm"
-        raise BadPointFile(str(path), cause, value="no description of the marker")
+        raise BadMarkerFile(str(path), cause, value="no description of the marker")
     if not rows or rows[0][1] not in (_COLUMNS, _COLUMNS + _SIGMAS):
-        raise BadPointFile(str(path), ",".join(_COLUMNS), value="the header is not understood")
+        raise BadMarkerFile(str(path), ",".join(_COLUMNS), value="the header is not understood")
     centres: dict[tuple[int, int], list[float]] = {}
     for line, fields in rows[1:]:
         key, values = _row(path, line, fields, len(rows[0][1]))
         if key in centres:
-            raise BadPointFile(str(path), "this circle stands in the file already", value=f"line {line}")
+            raise BadMarkerFile(str(path), "this circle stands in the file already", value=f"line {line}")
         centres[key] = values
     ids = tuple(sorted({marker for marker, _ in centres}))
     missing = [f"{marker}/{circle}" for marker in ids for circle in range(CIRCLES) if (marker, circle) not in centres]
     if missing or not ids:
-        raise BadPointFile(str(path), "each marker has the circles 0 to 3", value=f"missing: {', '.join(missing)}")
+        raise BadMarkerFile(str(path), "each marker has the circles 0 to 3", value=f"missing: {', '.join(missing)}")
     table = np.array([[centres[marker, circle] for circle in range(CIRCLES)] for marker in ids])
     name, sizes = header["dictionary"], (float(header[key]) for key in ("side", "radius", "offset"))
     return MarkerLayout(ids, table[..., :3], table[..., 3:], name, *sizes)
@@ -102,10 +102,10 @@ def _row(path: Path, line: int, fields: list[str], columns: int) -> tuple[tuple[
     try:
         key, values = (int(fields[0]), int(fields[1])), [float(text) for text in fields[2:]]
     except (ValueError, IndexError) as error:
-        raise BadPointFile(str(path), str(error), value=f"line {line}") from error
+        raise BadMarkerFile(str(path), str(error), value=f"line {line}") from error
     if len(fields) != columns or key[0] < 0 or key[1] not in range(CIRCLES):
-        raise BadPointFile(str(path), f"{columns} columns, circle 0 to 3", value=f"line {line}")
+        raise BadMarkerFile(str(path), f"{columns} columns, circle 0 to 3", value=f"line {line}")
     sigmas = values[3:] or [SURVEY_SIGMA_MM] * 3
     if not (max(abs(v) for v in values) <= _LARGEST_MM) or not (min(sigmas) > 0.0):
-        raise BadPointFile(str(path), "finite mm and sigmas greater than 0 are needed", value=f"line {line}")
+        raise BadMarkerFile(str(path), "finite mm and sigmas greater than 0 are needed", value=f"line {line}")
     return key, values[:3] + sigmas

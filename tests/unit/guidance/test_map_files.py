@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from docking.errors import BadPointFile, ConfigInvalid, ExtraMissing, FileUnreadable
+from docking.errors import BadMarkerFile, ConfigInvalid, ExtraMissing, FileUnreadable
 from docking.guidance import opencv as extra
 from docking.guidance.colmap_files import read_model, write_model
 from docking.guidance.input_files import SURVEY_SIGMA_MM, read_camera, read_layout
@@ -73,7 +73,7 @@ def test_sigmas_of_the_survey_are_read(tmp_path: Path) -> None:
 )
 def test_a_bad_marker_file_names_what_is_wrong(tmp_path: Path, text: str, says: str) -> None:
     (tmp_path / "m.csv").write_text(text)
-    with pytest.raises(BadPointFile, match=says):
+    with pytest.raises(BadMarkerFile, match=says):
         read_layout(tmp_path / "m.csv")
 
 
