@@ -1,4 +1,4 @@
-"""The invariants of the fault page, judged over every tick of a case, and what the case measured."""
+"""The invariants of tests/faults/README.md, judged over every tick of a case, and what the case measured."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.support.motion_record import AS_SENT_MM, ENABLED, MOVES_MM, QUICK_STO
 from tests.support.ready_cell import CYCLE_S, ReadyCell
 
 QUICK_STOP_BESIDE_MM = 0.005
-"""Largest distance of the healthy axes from their path during a synchronous quick stop. The fault page permits 0.02 mm;
+"""Largest distance of the healthy axes from their path during a synchronous quick stop. I3 permits 0.02 mm;
 drives that all ramped with one deceleration would leave these paths by 0.007 mm (lab) and more.
 """
 COUNT_MM_S2 = 2.0
