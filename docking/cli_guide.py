@@ -220,9 +220,7 @@ def evaluate(trajectory: Path, truth: Path, align: str, as_json: bool) -> int:
 @click.option("--job", type=FILE, help="The JOB file of the run, where it has moved since.")
 @click.option("--camera", type=FILE, help="Calibration of another camera than that of the map (TOML).")
 @click.option("--limit-mm", type=float, default=10.0, show_default=True, help="Largest predicted error that is drawn.")
-@click.option(
-    "--fps", type=float, default=10.0, show_default=True, help="Pictures a second of a folder and of the video."
-)
+@click.option("--fps", type=Range(min=0.01), default=10.0, show_default=True, help="Pictures of a folder a s.")
 @json_option
 def overlay(mapdir: Path, pictures: Path, as_json: bool, **options: Any) -> int:
     """Draw what a run's journal proves into pictures of the cell: component, targets, deviations, next move, next part.

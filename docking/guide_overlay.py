@@ -9,7 +9,7 @@ from typing import Any
 
 from docking.errors import BadArgument, FileUnwritable, NotLocalised, OverlayUncertain
 from docking.guidance.guide import Guide, answer, refusal
-from docking.guidance.images import Picture, pictures
+from docking.guidance.images import Picture, pictures, rate
 from docking.guidance.localiser import Localised
 from docking.guidance.opencv import opencv
 from docking.guidance.overlay import draw, draw_refusal
@@ -24,7 +24,7 @@ PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 @dataclass(frozen=True, eq=False)
 class OverlayRequest:
-    """What to draw into what; `now` to which ages are counted (default: the time of day)."""
+    """What to draw into what; `fps` of a folder; `now` to which ages are counted (default: the time of day)."""
 
     guide: Guide
     pictures: Path
@@ -44,6 +44,8 @@ def write_overlay(request: OverlayRequest) -> dict[str, Any]:
     """
     if not 0.0 < request.limit_mm < float("inf"):
         raise BadArgument("--limit-mm", "a positive length is needed", value=request.limit_mm)
+    if request.out.resolve() == request.pictures.resolve():
+        raise BadArgument("--out", "it would write over what it draws into", value=str(request.out))
     scene = build_scene(request.source, request.language, request.now)
     suffix = request.out.suffix.lower()
     if suffix in PICTURE_SUFFIXES:
@@ -76,6 +78,10 @@ def _video(request: OverlayRequest, scene: Scene) -> dict[str, Any]:
             said.append(facts)
             writer = writer or _writer(request, drawn)
             writer.write(drawn)
+    except BaseException:
+        if writer is not None:
+            request.out.unlink(missing_ok=True)
+        raise
     finally:
         if writer is not None:
             writer.release()
@@ -107,8 +113,8 @@ def _said(picture: Picture, found: Localised, scene: Scene) -> dict[str, Any]:
 
 def _writer(request: OverlayRequest, image: Image) -> Any:
     code = "mp4v" if request.out.suffix.lower() == ".mp4" else "MJPG"
-    size = (image.shape[1], image.shape[0])
-    writer = opencv().VideoWriter(str(request.out), opencv().VideoWriter_fourcc(*code), request.fps, size)
+    size, fps = (image.shape[1], image.shape[0]), rate(request.pictures, request.fps)
+    writer = opencv().VideoWriter(str(request.out), opencv().VideoWriter_fourcc(*code), fps, size)
     if not writer.isOpened():
         raise FileUnwritable(str(request.out), "OpenCV cannot write this kind of video here")
     return writer

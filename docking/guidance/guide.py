@@ -63,7 +63,7 @@ class Guide:
         """Exchange the map for one built again; all streams go on in it. Raises MapFrameDiffers and stays as it was."""
         index = indexed(load_map(folder))
         check_same_frame(self.localiser.ar_map, index.ar_map)
-        self.localiser = Localiser(index, self.localiser.camera, self.localiser.settings)
+        self.localiser = self.localiser.on(index)
         for stream in self._streams:
             stream.swap(index)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from docking.errors import FileUnreadable
 from docking.guidance.features import grey
@@ -13,6 +13,8 @@ from docking.guidance.types import Image
 
 SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"})
 FOLDER_FPS = 10.0
+_WHOLE = 0.9
+"""Of the pictures that a video states must be there; many containers only estimate their number."""
 
 
 class Picture(NamedTuple):
@@ -51,11 +53,26 @@ def read_image(path: Path, *, colour: bool = False) -> Image:
     return image
 
 
+def rate(source: Path, fps: float = FOLDER_FPS) -> float:
+    """Pictures a second: `fps` of a folder, its own of a video."""
+    if source.is_dir() or source.suffix.lower() in SUFFIXES:
+        return fps
+    capture = opencv().VideoCapture(str(source))
+    try:
+        return _rate(capture)
+    finally:
+        capture.release()
+
+
+def _rate(capture: Any) -> float:
+    return float(capture.get(opencv().CAP_PROP_FPS)) or FOLDER_FPS
+
+
 def _video(path: Path, *, colour: bool) -> Iterator[Picture]:
     cv2 = opencv()
     capture = cv2.VideoCapture(str(path))
     try:
-        fps = capture.get(cv2.CAP_PROP_FPS) or FOLDER_FPS
+        fps = _rate(capture)
         number = 0
         while True:
             there, image = capture.read()
@@ -65,5 +82,9 @@ def _video(path: Path, *, colour: bool) -> Iterator[Picture]:
             number += 1
         if number == 0:
             raise FileUnreadable(str(path), "not a video that OpenCV can read")
+        stated = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        if number < _WHOLE * stated:
+            cause = f"it ends after {number} of {stated:.0f} pictures: cut off when it was recorded or copied"
+            raise FileUnreadable(str(path), cause)
     finally:
         capture.release()

@@ -72,8 +72,8 @@ class Localised:
 
     `points` map points agree out of `expected` that the pose should see; `rms_px` of those; `depth_mm` their median
     depth. `map_sigma_mm` is the standard deviation of mapped places, shared by neighbouring points; `frame` what it is
-    more away from the markers (None for a pose from markers). `generation` is 0 where the points were in the map as
-    built, and grows with those that tracking added.
+    more away from the markers that hold it: those of the map, or those in view for a pose from markers. `generation` is
+    0 where the points were in the map as built, and grows with those that tracking added.
     `feature_rows`, `point_rows` say which features of the image are which points of the map.
     """
 
@@ -141,6 +141,7 @@ class Localiser:
         self, ar_map: ArMap | Indexed, camera: Camera | None = None, settings: LocaliseSettings | None = None
     ) -> None:
         self.index = ar_map if isinstance(ar_map, Indexed) else indexed(ar_map)
+        self._stated = camera
         self.camera = camera or self.index.ar_map.camera
         self.settings = settings or LocaliseSettings()
         self._frame = FrameError.of(self.index.ar_map)
@@ -149,6 +150,10 @@ class Localiser:
     def ar_map(self) -> ArMap:
         """The map that is looked up; in the frame of the cell, mm."""
         return self.index.ar_map
+
+    def on(self, index: Indexed) -> Localiser:
+        """The same on another map: a camera that was not stated is that of the map, as it was adjusted with it."""
+        return Localiser(index, self._stated, self.settings)
 
     def localise(self, image: Image, hint: Pose | None = None) -> Localised:
         """The pose of one image (h, w) or (h, w, 3). Raises NotLocalised with the cause, BadArgument, ExtraMissing."""
@@ -191,9 +196,16 @@ class Localiser:
 
     def _by_markers(self, image: Image, layout: MarkerLayout) -> Localised:
         fit, sights = locate_by_markers(grey(image), layout, self.camera)
+        seen = int(np.count_nonzero(fit.inside))
+        if _second_pose(self.camera, fit, sights):
+            raise self._refused("two poses fit the markers", seen, len(sights))
         depth = float(np.median(fit.X_WC.inverse().apply(sights.points_mm)[:, 2]))
-        seen, sigma = int(np.count_nonzero(fit.inside)), self.settings.map_sigma_mm
-        return Localised(fit.X_WC, fit.cov, "marker", seen, len(sights), fit.rms_px, depth, sigma, 0.0, self.camera)
+        # A doubt about the markers of the map is one about these; away from those in view the pose swings.
+        sigma = max(self.settings.map_sigma_mm, self._frame.rms_mm)
+        frame = FrameError(sights.points_mm, self._frame.rms_mm)
+        return Localised(
+            fit.X_WC, fit.cov, "marker", seen, len(sights), fit.rms_px, depth, sigma, 0.0, self.camera, frame
+        )
 
     def _anywhere(self, features: Features, hint: Pose | None) -> Localised:
         first: NotLocalised | None = None

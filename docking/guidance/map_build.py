@@ -119,11 +119,12 @@ def _named(request: BuildRequest, poses: dict[str, Pose]) -> Iterator[tuple[Pict
 
 
 def _timed(request: BuildRequest, path: Path) -> Iterator[tuple[Picture, Pose]]:
-    trajectory = read_tum(path)
-    taken = list(pictures(request.source, request.fps))
-    found = poses_by_time(trajectory, [picture.t_s for picture in taken])
-    for row in thinned(sorted(found)):
-        yield taken[row], found[row]
+    # Read twice rather than kept: a long video does not fit into memory.
+    found = poses_by_time(read_tum(path), [picture.t_s for picture in pictures(request.source, request.fps)])
+    wanted = set(thinned(sorted(found)))
+    for row, picture in enumerate(pictures(request.source, request.fps)):
+        if row in wanted:
+            yield picture, found[row]
 
 
 def place(scanned: Scanned, layout: MarkerLayout, method: Method, settings: MethodSettings) -> ArMap:

@@ -74,7 +74,7 @@ def load_map(folder: Path) -> ArMap:
         with np.load(io.BytesIO((folder / _ARRAYS).read_bytes()), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
     except OSError as error:
-        raise FileUnreadable(str(folder), error.strerror or str(error)) from error
+        raise FileUnreadable(str(error.filename or folder), error.strerror or str(error)) from error
     except (ValueError, zipfile.BadZipFile) as error:
         raise ConfigInvalid(str(folder), (f"not a map: {error}",)) from error
     if head.get("format") != FORMAT:

@@ -70,7 +70,7 @@ class Tracker:
         is not in that frame, or whose markers stand at other places.
         """
         check_same_frame(self.localiser.ar_map, index.ar_map)
-        self.localiser = Localiser(index, self.localiser.camera, self.localiser.settings)
+        self.localiser = self.localiser.on(index)
         self._anchor = None
 
     def _predicted(self, t_s: float) -> Pose | None:
@@ -105,7 +105,7 @@ class Tracker:
         if grown is not None:
             self.counts.keyframes_added += 2
             self.counts.points_added += len(grown.ar_map.points_mm) - len(self.localiser.ar_map.points_mm)
-            self.localiser = Localiser(grown, self.localiser.camera, self.localiser.settings)
+            self.localiser = self.localiser.on(grown)
             self._anchor = None
 
 

@@ -8,6 +8,7 @@ its own, and fields named `_mm` are in that unit.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -50,6 +51,16 @@ class Camera:
         """(5,) k1, k2, p1, p2, k3."""
         return np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
 
+    @cached_property
+    def widest(self) -> float:
+        """Radius in undistorted normalised coordinates up to which the radial distortion grows.
+
+        Beyond it the polynomial turns round and would bring what lies far beside the picture back into it.
+        """
+        slope_of_r2 = np.roots([7.0 * self.k3, 5.0 * self.k2, 3.0 * self.k1, 1.0])
+        turns = [float(r2.real) for r2 in slope_of_r2 if abs(r2.imag) < 1e-9 and r2.real > 0.0]
+        return float(np.sqrt(min(turns))) if turns else float("inf")
+
     def distort(self, xy: ArrayLike) -> Array:
         """Normalised image coordinates (..., 2) -> distorted normalised coordinates (..., 2)."""
         p = np.asarray(xy, dtype=np.float64)
@@ -70,10 +81,16 @@ class Camera:
         return result
 
     def project(self, points_C: ArrayLike) -> Array:
-        """Points (..., 3) in the camera's frame -> pixels (..., 2); points not in front of it become NaN."""
+        """Points (..., 3) in the camera's frame -> pixels (..., 2).
+
+        Points not in front of it, or so far aside that the lens model does not hold (`widest`), become NaN.
+        """
         p = np.asarray(points_C, dtype=np.float64)
         depth = np.where(p[..., 2:] > 0.0, p[..., 2:], np.nan)
-        return self.to_pixels(p[..., :2] / depth)
+        xy = p[..., :2] / depth
+        if self.widest < np.inf:
+            xy = np.where(np.linalg.norm(xy, axis=-1, keepdims=True) < self.widest, xy, np.nan)
+        return self.to_pixels(xy)
 
     def undistort(self, pixels: ArrayLike) -> Array:
         """Pixels (..., 2) -> undistorted normalised coordinates (..., 2): (x, y, 1) is the ray. Fixed-point steps."""

@@ -121,6 +121,21 @@ def test_a_video_carries_the_refusal_of_what_is_not_localised(
     assert out.stat().st_size > 1000
 
 
+def test_a_video_keeps_its_speed(bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    writer = cv2.VideoWriter(str(tmp_path / "walk.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (640, 480))
+    for _ in range(2):
+        writer.write(cv2.imread(str(bench.photo)))
+    writer.release()
+    out = tmp_path / "seen.avi"
+    command = ["guide", "overlay", str(bench.ar_map), str(tmp_path / "walk.avi"), "--journal", str(bench.journal)]
+    assert call([*command, "--out", str(out), "--json"]) == 0
+    seen = cv2.VideoCapture(str(out))
+    assert seen.get(cv2.CAP_PROP_FPS) == pytest.approx(25.0)
+    assert call([*command, "--out", str(tmp_path / "walk.avi"), "--json"]) == 2
+    assert call([*command, "--out", str(out), "--fps", "0", "--json"]) == 2
+    capsys.readouterr()
+
+
 def test_a_picture_of_another_place_is_refused_and_no_file_written(bench: Bench, tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "x.png"), np.random.default_rng(1).integers(0, 255, (480, 640), dtype=np.uint8))
     command = ["guide", "overlay", str(bench.ar_map), str(tmp_path / "x.png"), "--journal", str(bench.journal)]

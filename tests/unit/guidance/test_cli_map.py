@@ -73,6 +73,25 @@ def test_what_is_no_scan_and_no_gate_is_told(tmp_path: Path, capsys: pytest.Capt
     assert call(["guide", "export", str(tmp_path), "--json"]) == 2
 
 
+def test_a_video_that_was_cut_off_is_refused_and_not_taken_for_a_short_one(
+    video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = video.read_bytes()
+    (tmp_path / "cut.avi").write_bytes(whole[: len(whole) // 2])
+    assert _build(tmp_path / "cut.avi", tmp_path / "map", "--json") == 2
+    error = json.loads(capsys.readouterr().out)["error"]
+    assert error["code"] == 4001
+    assert "of 16 pictures" in error["message"]
+    assert not (tmp_path / "map").exists()
+
+
+def test_a_folder_without_a_map_names_the_file_that_is_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert call(["guide", "export", str(tmp_path), "--tum", str(tmp_path / "k.tum"), "--json"]) == 2
+    assert json.loads(capsys.readouterr().out)["error"]["where"] == str(tmp_path / "map.json")
+
+
 def test_markers_are_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert call(["guide", "markers", "--out", str(tmp_path / "m.pdf"), "--ids", "0-2", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"files": [str(tmp_path / "m.pdf")], "markers": [0, 1, 2]}

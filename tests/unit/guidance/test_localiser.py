@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from docking.errors import BadArgument, NotLocalised
 from docking.guidance.localiser import Localised, Localiser, LocaliseSettings
+from docking.guidance.marker_pose import locate_by_markers
 from docking.guidance.types import Image
 from docking.types import Array, Pose
 from sim.camera import SimulatedCamera
@@ -103,6 +105,7 @@ def test_a_picture_of_another_size_is_refused(localiser: Localiser) -> None:
         localiser.localise(picture(HERE)[:400])
 
 
+@cache
 def bare_wall_map() -> Localiser:
     """A map whose points look like nothing in view: only its markers help."""
     ar_map = guided_cell().ar_map
@@ -128,6 +131,34 @@ def test_a_marker_that_was_moved_gives_no_pose() -> None:
     index = replace(localiser.index, ar_map=replace(localiser.ar_map, layout=replace(layout, circles_mm=moved)))
     with pytest.raises(NotLocalised):
         Localiser(index).localise(picture(view(50.0, 1050.0, 550.0)))
+
+
+def test_one_marker_alone_gives_no_pose() -> None:
+    """Its four circles fit wherever it hangs: after a move by 20 mm all would be drawn 20 mm off."""
+    layout, image = guided_cell().layout, picture(view(50.0, 1050.0, 550.0))
+    fit, sights = locate_by_markers(image, layout, CAMERA)
+    assert len(sights) == 12
+    assert np.linalg.norm(fit.X_WC.t_mm - view(50.0, 1050.0, 550.0).t_mm) < 2.0
+    rows = [k for k, own in enumerate(layout.circles_mm) if np.all(sights.points_mm == own[0], axis=1).any()]
+    for row in rows:
+        moved = layout.circles_mm[[row]] + (20.0, 0.0, 0.0)
+        with pytest.raises(NotLocalised, match=f"marker {layout.ids[row]} alone"):
+            locate_by_markers(image, replace(layout, ids=layout.ids[row : row + 1], circles_mm=moved), CAMERA)
+    assert len(rows) == 3
+
+
+def test_a_doubt_about_the_markers_is_one_about_poses_from_them() -> None:
+    localiser = bare_wall_map()
+    image = picture(view(50.0, 1050.0, 550.0))
+    sure = localiser.localise(image)
+    assert sure.predicted_error_mm() < 5.0
+    quality = replace(localiser.ar_map.quality, doubt_mm=30.0)
+    doubtful = Localiser(replace(localiser.index, ar_map=replace(localiser.ar_map, quality=quality))).localise(image)
+    assert doubtful.source == "marker"
+    assert doubtful.predicted_error_mm() >= 60.0
+    # Two metres beside the markers in view the pose says less about a place than among them.
+    aside = sure.X_WC.apply(np.array([2000.0, 0.0, sure.depth_mm]))
+    assert sure.predicted_error_mm(aside) > 2.0 * sure.predicted_error_mm()
 
 
 def test_markers_are_not_used_unless_allowed() -> None:

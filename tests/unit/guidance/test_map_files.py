@@ -109,6 +109,18 @@ def _same(a: ArMap, b: ArMap) -> None:
     assert np.array_equal(a.points_mm, b.points_mm)
 
 
+def test_what_lies_beside_the_picture_does_not_fold_back_into_it() -> None:
+    """Beyond r = 0.93 this polynomial falls again: (1.5, 0, 1) would land at pixel 289, in the middle of the left."""
+    lens = Camera(960, 720, 700.0, 700.0, 479.5, 359.5, k1=0.15, k2=-0.3)
+    beside = np.array([[1.5, 0.0, 1.0], [-1.5, 0.2, 1.0], [0.0, 3.0, 1.0]])
+    assert np.isnan(lens.project(beside)).all()
+    assert np.isfinite(lens.project([[0.68, 0.51, 1.0], [0.9, 0.0, 1.0]])).all()
+    slope = lens.to_pixels(np.array([[lens.widest, 0.0], [lens.widest - 1e-4, 0.0]]))
+    assert slope[0, 0] == pytest.approx(slope[1, 0], abs=1e-4)
+    assert replace(lens, k1=0.1, k2=0.0).widest == np.inf
+    assert np.isfinite(replace(lens, k1=0.0, k2=0.0).project(beside)).all()
+
+
 def test_a_map_comes_back_from_its_folder(wall: Wall, tmp_path: Path) -> None:
     quality = MapQuality("joint", (0, 2), {5: "moved"}, ("0001.png",), 1.5, 0.1, 0.8, 2.0, 0.3, ("look",))
     ar_map = replace(wall.free, layout=wall.layout, quality=quality)

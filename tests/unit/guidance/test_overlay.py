@@ -61,6 +61,17 @@ def test_a_line_that_begins_behind_the_camera_is_not_drawn_across_the_picture() 
     assert len(drawn_at(image, "good")) == 0 or drawn_at(image, "good")[:, 0].min() >= 0
 
 
+def test_what_the_lens_model_would_fold_into_the_picture_is_not_drawn() -> None:
+    lens = replace(CAMERA, k1=0.15, k2=-0.3)
+    at = replace(found(), camera=lens, cov=np.eye(6) * 1e-12)
+    beside = X_WC.apply(np.array([[1200.0, 0.0, 800.0]]))
+    x, y = lens.to_pixels(np.array([1.5, 0.0]))
+    assert 0.0 < x < 640.0
+    assert 0.0 < y < 480.0
+    image = draw(GREY, at, scene(marks=(Mark(beside[0], "", "bad"),)), 10.0)
+    assert len(drawn_at(image, "bad")) == 0
+
+
 def test_nothing_is_drawn_where_the_error_could_exceed_the_limit() -> None:
     good = scene(marks=(Mark(np.zeros(3), "", "good"),))
     draw(GREY, found(2.0), good, 10.0)

@@ -73,6 +73,18 @@ def test_a_fresh_map_takes_over_in_the_same_frame() -> None:
     assert np.linalg.norm(tracker.step("after", 0.5, picture(there)).X_WC.t_mm - there.t_mm) < 4.0
 
 
+def test_the_camera_of_the_fresh_map_is_used_unless_another_was_stated() -> None:
+    """Both maps were adjusted with a camera of their own; the poses of one in the other's are off."""
+    ar_map = guided_cell().ar_map
+    finer = replace(ar_map, camera=replace(ar_map.camera, fx_px=ar_map.camera.fx_px * 1.002))
+    stated = replace(ar_map.camera, fx_px=ar_map.camera.fx_px * 0.999)
+    own, given = (Tracker(Localiser(ar_map, camera, MAP_ONLY)) for camera in (None, stated))
+    for tracker in (own, given):
+        tracker.swap(replace(tracker.localiser.index, ar_map=finer))
+    assert own.localiser.camera == finer.camera
+    assert given.localiser.camera == stated
+
+
 def test_a_map_of_another_frame_is_refused() -> None:
     ar_map = guided_cell().ar_map
     tracker = Tracker(Localiser(ar_map, settings=MAP_ONLY))
