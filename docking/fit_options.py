@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 
 from docking.errors import BadArgument
-from docking.noise_spec import noise_from, with_noise
+from docking.noise_spec import noise_from, noise_known, with_noise
 from docking.pose import METHODS, FitSettings, Method
 from docking.pose.locks import ANGLES
 from docking.pose.settings import FREEDOMS, Freedom
@@ -115,11 +115,12 @@ def settings_from(
 def prepared(options: FitOptions, nominal: Points, measured: Points) -> tuple[Points, Points]:
     """Nominal points at their stated temperature, and readings with the stated noise where the file gives no sigma.
 
-    With a stated noise a nominal point without sigma is taken as exact.
+    Where every reading's noise is stated, by columns or by the option, a nominal point without sigma is taken as exact.
     """
     nominal = replace(nominal, xyz_mm=nominal.xyz_mm * (1.0 + expansion_from(options.temperature)))
-    if options.noise is None:
+    if options.noise is not None:
+        measured = with_noise(measured, noise_from(options.noise))
+    if not noise_known(measured):
         return nominal, measured
     known = np.all(np.isfinite(nominal.cov_mm2), axis=(1, 2), keepdims=True)
-    exact = replace(nominal, cov_mm2=np.where(known, nominal.cov_mm2, 0.0))
-    return exact, with_noise(measured, noise_from(options.noise))
+    return replace(nominal, cov_mm2=np.where(known, nominal.cov_mm2, 0.0)), measured

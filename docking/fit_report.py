@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import degrees
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,11 @@ import numpy as np
 from docking.errors import PoseError
 from docking.fit_options import FitOptions, expansion_from, prepared, settings_from
 from docking.geometry import matrix_to_euler, skew
+from docking.noise_spec import noise_known
 from docking.point_file import read_points, read_weights
-from docking.pose import fit_pose, screen
+from docking.pose import FitSettings, fit_pose, screen
 from docking.pose.locks import turning_axes
-from docking.pose.passes import lost_beam
-from docking.pose.quantiles import chi2_tail
+from docking.pose.quantiles import chi2_tail, fisher_tail
 from docking.types import Array, Fit, Points, Pose, Rejection, Screened
 
 SIGMAS = ("alpha_deg", "beta_deg", "gamma_deg", "x_mm", "y_mm", "z_mm")
@@ -33,12 +33,15 @@ _EMPTY: dict[str, Any] = {
     "dropped_readings": [],
     "residuals_mm": {},
     "refused": None,
+    "refused_code": None,
+    "remedy": None,
     "method": None,
     "covariance": None,
     "sigma": None,
     "chi2": None,
     "dof": None,
     "chi2_p": None,
+    "locks_p": None,
     "redundancy": None,
     "scale": None,
     "swapped": {},
@@ -48,7 +51,8 @@ _EMPTY: dict[str, Any] = {
 @dataclass(frozen=True, eq=False)
 class FitResult:
     """What came of one `docking fit`: the fit and its points, or the refusal. `given` is the stated expansion,
-    `sigmas_known` whether every point's covariance was stated."""
+    `sigmas_known` whether every point's covariance was stated, `free` the fit with nothing held where locks were asked.
+    """
 
     nominal: Points
     fit: Fit | None
@@ -56,6 +60,7 @@ class FitResult:
     refusal: PoseError | None
     given: float
     sigmas_known: bool
+    free: Fit | None = None
 
 
 def run_fit(nominal_path: str | Path, measured_path: str | Path, options: FitOptions | None = None) -> FitResult:
@@ -66,20 +71,44 @@ def run_fit(nominal_path: str | Path, measured_path: str | Path, options: FitOpt
     written = {**read_weights(Path(nominal_path)), **read_weights(Path(measured_path))}
     settings = settings_from(options, nominal, measured, written)
     nominal, measured = prepared(options, nominal, measured)
-    known = bool(np.all(np.isfinite(nominal.cov_mm2))) and _noise_known(measured)
+    known = bool(np.all(np.isfinite(nominal.cov_mm2))) and noise_known(measured)
     given = expansion_from(options.temperature)
     try:
         screened = screen(nominal, measured, settings)
-        return FitResult(nominal, fit_pose(screened, settings), screened, None, given, known)
+        fit, free = _fits(screened, settings, known)
+        return FitResult(nominal, fit, screened, None, given, known, free if settings.locks else None)
     except PoseError as refusal:
         return FitResult(nominal, None, None, refusal, given, known)
 
 
-def _noise_known(points: Points) -> bool:
-    """Whether every reading that can be used has a covariance: a lost beam needs none."""
-    return all(
-        lost_beam(xyz) or bool(np.all(np.isfinite(cov))) for xyz, cov in zip(points.xyz_mm, points.cov_mm2, strict=True)
-    )
+def _fits(screened: Screened, settings: FitSettings, sigmas_known: bool) -> tuple[Fit, Fit]:
+    """The fit as asked for, and the one with nothing held.
+
+    Where the residuals tell the scale of the noise, weights are ratios: multiplied all by one number they say the same.
+    The variance factor of the weighted fit, with nothing held, makes its covariance so.
+    """
+    fit = fit_pose(screened, settings)
+    free = fit_pose(screened, replace(settings, locks=())) if settings.locks else fit
+    if sigmas_known or not settings.weights or settings.method != "ml" or not (free.dof > 0):
+        return fit, free
+    factor = max(free.chi2 / free.dof, np.finfo(np.float64).tiny)
+    scaled, free = (replace(f, cov=factor * f.cov, chi2=f.chi2 / factor) for f in (fit, free))
+    return scaled, free
+
+
+def locks_p(result: FitResult) -> float | None:
+    """Probability that held values which are true enlarge chi-square so much; None where nothing was held.
+
+    By chi-square with as many degrees of freedom as are held where the sigmas were stated, else by F against the
+    variance factor of the fit with nothing held.
+    """
+    if result.fit is None or result.free is None:
+        return None
+    held, more = result.fit.dof - result.free.dof, max(result.fit.chi2 - result.free.chi2, 0.0)
+    if result.sigmas_known:
+        return chi2_tail(more, held)
+    below = max(result.free.chi2 / result.free.dof, np.finfo(np.float64).tiny)
+    return fisher_tail(more / held / below, held, result.free.dof)
 
 
 def centroid_cov(fit: Fit, centroid_M_mm: Array) -> Array:
@@ -132,13 +161,15 @@ def fit_json(result: FitResult) -> dict[str, Any]:
 
     `pose` is X_MN (nominal into measured coordinates); `residuals_mm` measured minus fitted, passes averaged; `used`
     and `rejected` name the points; `dropped_readings` are single passes left out of a used point; `refused` is the
-    reason why no pose is given, else null. `covariance`: see `centroid_cov`, the centroid is that of the used points.
-    `chi2_p` is null where the sigmas were taken from the residuals themselves, or the method does not use them.
+    reason why no pose is given, with `refused_code` and `remedy`, else null. `covariance`: see `centroid_cov`, the
+    centroid is that of the used points. `chi2_p` is null where the sigmas were taken from the residuals themselves, or
+    the method does not use them; `locks_p`: see there.
     """
     fit, screened = result.fit, result.screened
     if fit is None or screened is None:
         assert result.refusal is not None
-        return {**_EMPTY, **_rejected_json(result.refusal.rejected), "refused": result.refusal.text()}
+        why = {"refused": result.refusal.text(), "refused_code": result.refusal.code, "remedy": result.refusal.remedy()}
+        return {**_EMPTY, **_rejected_json(result.refusal.rejected), **why}
     judged = result.sigmas_known and fit.method == "ml"
     return {
         **_EMPTY,
@@ -155,6 +186,7 @@ def fit_json(result: FitResult) -> dict[str, Any]:
         "chi2": fit.chi2,
         "dof": fit.dof,
         "chi2_p": chi2_tail(fit.chi2, fit.dof) if judged else None,
+        "locks_p": locks_p(result),
         "redundancy": fit.redundancy,
         "scale": (1.0 + result.given) * (1.0 + fit.expansion),
     }
@@ -185,6 +217,10 @@ def judgement_lines(result: dict[str, Any]) -> list[str]:
         verdict = _TOO_LARGE if not (p >= _DOUBTFUL) else _TOO_SMALL if p > 1.0 - _DOUBTFUL else _EXPECTED
         text = f"chi2 {result['chi2']:.1f} for {result['dof']} degrees of freedom (p = {p:.3g})"
         lines.append(f"{text}: {verdict}")
+    if result["locks_p"] is not None:
+        p = result["locks_p"]
+        verdict = "as the points let expect" if p >= _DOUBTFUL else "THE POINTS CONTRADICT THE HELD VALUES"
+        lines.append(f"held degrees of freedom (p = {p:.3g}): {verdict}")
     if result["redundancy"] == 0:
         lines.append("NO REDUNDANCY: three points define a pose, nothing in the fit could prove it wrong")
     if result["scale"] != 1.0:
@@ -197,7 +233,8 @@ def fit_text(result: dict[str, Any]) -> str:
     tail = _rejected_lines("rejected points", result["rejected"])
     tail += _rejected_lines("readings left out", result["dropped_readings"])
     if result["refused"] is not None:
-        return "\n".join([f"no pose: {result['refused']}", *tail])
+        head = [f"no pose: {result['refused_code']}: {result['refused']}", f"    -> {result['remedy']}"]
+        return "\n".join([*head, *tail])
     pose = result["pose"]
     lines = [
         "pose of the nominal in the measured frame, R = Rz(gamma) Ry(beta) Rx(alpha)",

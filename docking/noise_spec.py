@@ -47,5 +47,12 @@ def with_noise(points: Points, of: CovarianceOf) -> Points:
     return replace(points, cov_mm2=cov)
 
 
+def noise_known(points: Points) -> bool:
+    """Whether every reading that can be used has a covariance: a lost beam needs none."""
+    return all(
+        lost_beam(xyz) or bool(np.all(np.isfinite(cov))) for xyz, cov in zip(points.xyz_mm, points.cov_mm2, strict=True)
+    )
+
+
 def _number(text: str) -> float:
     return float(text) if _NUMBER.fullmatch(text.strip()) else float("nan")

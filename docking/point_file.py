@@ -83,8 +83,19 @@ def _header(
     line, fields = rows[0]
     header = tuple(f.lower() for f in fields)
     if header not in known:
-        _bad(path, f"line {line}: {','.join(fields)[:80]!r}", "the header is not understood")
+        _bad(path, f"line {line}: {','.join(fields)[:80]!r}", _not_understood(header))
     return header
+
+
+def _not_understood(header: tuple[str, ...]) -> str:
+    """What is wrong with a header, as far as it can be told."""
+    text = ",".join(header)
+    for mark, word in ((";", "semicolons"), ("\t", "tabs")):
+        if mark in text:
+            return f"{word} separate its columns: commas are needed, and a point in numbers"
+    needed = _FULL if any(column in header for column in _SIGMAS) else _PLAIN
+    missing = [column for column in needed if column not in header]
+    return f"missing: {', '.join(missing)}" if missing else "the header is not understood"
 
 
 def read_points(path: Path, role: Role, *, weighted: bool = False) -> Points:

@@ -31,6 +31,11 @@ def fisher_upper(probability: float, dof: int, dof_below: Array) -> Array:
     return result
 
 
+def fisher_tail(value: float, dof: int, dof_below: int) -> float:
+    """Probability that F with `dof` over `dof_below` degrees of freedom exceeds `value`."""
+    return float(special.fdtrc(dof, dof_below, value))
+
+
 def chi2_tail(value: float, dof: int) -> float:
     """Probability that chi-square with `dof` degrees of freedom exceeds `value`; 1 without degrees of freedom."""
     return float(special.chdtrc(dof, value)) if dof > 0 else 1.0

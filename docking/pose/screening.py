@@ -22,7 +22,7 @@ from docking.pose.quantiles import chi2_tail
 from docking.pose.reasons import Reasons, explain
 from docking.pose.relabel import relabelled
 from docking.pose.settings import FitSettings
-from docking.pose.snooping import Pairs, Tested, all_agree, residuals_mm, snoop
+from docking.pose.snooping import SMALLEST_SIGMA_MM, Pairs, Tested, all_agree, residuals_mm, snoop
 from docking.pose.svd import fit_svd, mirrored_rms_mm
 from docking.types import Array, Points, Rejection, Screened
 
@@ -33,8 +33,6 @@ _PLAUSIBLE = 0.002
 """A rival whose chi-square is less probable than this is an accident of its few distances."""
 _ACCIDENTS = 0.3
 """A minority is believed when fewer sets of its size than this are to be expected by chance."""
-_SMALLEST_SIGMA_MM = 1e-4
-"""Estimated sigmas do not fall below this: noiseless files still carry rounding."""
 
 
 class _Graph(NamedTuple):
@@ -192,7 +190,7 @@ def _with_sigma(pairs: Pairs, sigma_mm: float) -> Pairs:
     for cov, miss in zip(sides, unknown, strict=True):
         given += np.where(miss, 0.0, np.trace(np.nan_to_num(cov), axis1=1, axis2=2) / 3.0)
     missing = unknown[0].astype(int) + unknown[1].astype(int)
-    share = np.maximum(sigma_mm**2 - given, _SMALLEST_SIGMA_MM**2) / np.maximum(missing, 1)
+    share = np.maximum(sigma_mm**2 - given, SMALLEST_SIGMA_MM**2) / np.maximum(missing, 1)
     filled = [
         np.where(miss[:, None, None], share[:, None, None] * np.eye(3), cov)
         for cov, miss in zip(sides, unknown, strict=True)
@@ -345,7 +343,7 @@ def _accidental(graph: _Graph, kept: list[int]) -> float:
 def _posterior_sigma_mm(pairs: Pairs, tested: Tested) -> float:
     """sqrt(sum |r|^2 / (3 n - 6)) of the kept points."""
     r = residuals_mm(pairs.rows(tested.kept), tested.solution)
-    return max(float(np.sqrt(np.sum(r * r) / max(3 * len(r) - 6, 1))), _SMALLEST_SIGMA_MM)
+    return max(float(np.sqrt(np.sum(r * r) / max(3 * len(r) - 6, 1))), SMALLEST_SIGMA_MM)
 
 
 def _named(rejected: list[Rejection]) -> str:

@@ -21,6 +21,8 @@ from docking.types import Array
 
 _ROUNDS = 40
 _LEAST_SCALED = 4
+SMALLEST_SIGMA_MM = 1e-4
+"""An estimated sigma is not believed below this: files and arithmetic round."""
 _POINTS_SHARE = 0.8
 """Share of the permitted false alarms that the test of single points may spend; the rest is for the choice among sets
 and the global test, which see the same noise in other combinations."""
@@ -102,7 +104,8 @@ def _ratio(pairs: Pairs, kept: list[int], statistics: Array, alpha: float, scale
     # By the rank-one identity the other points' sum of squares is the total minus the statistic of the point tested.
     others = np.where(inside, np.maximum(total - statistics, 1e-9 * max(total, 1e-30)), total) / dof
     threshold = fisher_upper(alpha / n, 3, dof)
-    result: Array = statistics / 3.0 / np.maximum(others, 1e-300) / threshold
+    variance = np.trace(pairs.nominal_cov_mm2 + pairs.measured_cov_mm2, axis1=1, axis2=2).mean() / 3.0
+    result: Array = statistics / 3.0 / np.maximum(others, SMALLEST_SIGMA_MM**2 / variance) / threshold
     return result
 
 

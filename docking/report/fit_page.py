@@ -26,13 +26,16 @@ _SHARE = 0.15
 def write_fit_page(result: FitResult, title: str, path: Path) -> None:
     """Write the page of one `docking fit`, a refused one too. Raises FileUnwritable."""
     answer = fit_json(result)
-    parts = (
-        [f'<p class="bad">No pose: {escape(answer["refused"])}</p>'] if answer["refused"] else _fitted(result, answer)
-    )
+    parts = _refused(answer) if answer["refused"] else _fitted(result, answer)
     parts += _rejected("Rejected points", answer["rejected"]) + _rejected(
         "Readings left out", answer["dropped_readings"]
     )
     write_sheet(title, parts, path)
+
+
+def _refused(answer: dict[str, Any]) -> list[str]:
+    why = escape(f"No pose: {answer['refused_code']}: {answer['refused']}")
+    return [f'<p class="bad">{why}</p>', f"<p>{escape(answer['remedy'])}</p>"]
 
 
 def _fitted(result: FitResult, answer: dict[str, Any]) -> list[str]:

@@ -88,6 +88,20 @@ def test_sigma_columns_win_over_the_noise(fitted: Fitted) -> None:
     assert stated["sigma"]["x_mm"] == pytest.approx(2.0 * plain["sigma"]["x_mm"], rel=1e-6)
 
 
+def test_sigma_columns_alone_state_the_noise(fitted: Fitted) -> None:
+    """Nominal points without sigma are exact then, as they are beside --noise."""
+    column, option = fitted(seen(), sigma=",0.04,0.04,0.04")[1], fitted(seen(), "--noise", "iso:0.04")[1]
+    assert column == option
+    assert column["chi2_p"] is not None
+
+
+def test_exact_points_are_all_kept(fitted: Fitted) -> None:
+    """What is left is rounding, in which no point stands out."""
+    for grid in (J, np.round(J), J + 1e6):
+        told = fitted(grid, nominal=grid)[1]
+        assert (told["used"], told["rejected"]) == (NAMES, [])
+
+
 def test_without_sigmas_chi_square_proves_nothing(fitted: Fitted) -> None:
     told = fitted(seen())[1]
     assert told["chi2_p"] is None
@@ -127,6 +141,38 @@ def test_locks_hold(fitted: Fitted) -> None:
     assert told["sigma"]["z_mm"] < 1e-6 < told["sigma"]["x_mm"]
     at_zero = fitted(pose_from_vector([5.0, 0.0, 0.0, 0.0, 0.0, 3.0]).apply(J), "--lock", "y,z,alpha,beta")[1]
     assert [at_zero["pose"][k] for k in SIX] == pytest.approx([5.0, 0.0, 0.0, 0.0, 0.0, 3.0], abs=1e-6)
+
+
+@pytest.mark.parametrize("noise", [("--noise", "iso:0.05"), ()])
+def test_held_values_are_judged(fitted: Fitted, noise: tuple[str, ...]) -> None:
+    """True values are called doubtful as often as the level says; values half a millimetre off always."""
+    X, levels = pose_from_vector(VECTOR), []
+    for seed in range(80):
+        p = X.apply(J) + np.random.default_rng(seed).normal(0.0, 0.05, J.shape)
+        told = fitted(p, *noise, "--lock", "x=100,z=300,gamma=30")[1]
+        if len(told["used"]) == len(NAMES):
+            levels.append(told["locks_p"])
+    assert len(levels) > 70
+    assert np.mean(levels) == pytest.approx(0.5, abs=4.0 * np.sqrt(1.0 / 12.0 / len(levels)))
+    assert np.mean(np.array(levels) < 0.2) == pytest.approx(0.2, abs=4.0 * np.sqrt(0.16 / len(levels)))
+    assert fitted(p, *noise, "--lock", "z=300.5")[1]["locks_p"] < 1e-6
+    assert fitted(p, *noise)[1]["locks_p"] is None
+
+
+def test_weights_are_ratios_where_the_residuals_tell_the_scale(fitted: Fitted) -> None:
+    """Whoever gives 1 / sigma^2 as weights gets the same sigmas as whoever gives 1 and 4, and true ones."""
+    X, sigma, squares = pose_from_vector(VECTOR), np.where(np.arange(10) < 5, 0.04, 0.08), []
+    small, large = (",".join(f"{n}={w / s**2:.12g}" for n, s in zip(NAMES, sigma, strict=True)) for w in (1.0, 0.04**2))
+    for seed in range(100):
+        p = X.apply(J) + sigma[:, None] * np.random.default_rng(seed).normal(size=J.shape)
+        told = fitted(p, "--weights", small)[1]
+        if len(told["used"]) == 10:
+            squares.append([((told["pose"][k] - t) / told["sigma"][k]) ** 2 for k, t in zip(SIX, VECTOR, strict=True)])
+    other = fitted(p, "--weights", large)[1]
+    assert other["sigma"] == pytest.approx(told["sigma"], rel=1e-6)
+    assert other["chi2"] == pytest.approx(told["chi2"], rel=1e-6)
+    # A square over a variance from 24 degrees of freedom has the mean 24 / 22.
+    assert np.mean(squares) == pytest.approx(24.0 / 22.0, abs=4.0 * np.sqrt(2.0 / len(squares) / 3.0))
 
 
 def test_excluded_points_and_a_chosen_triangle(fitted: Fitted) -> None:
@@ -245,7 +291,9 @@ def test_a_refused_fit_has_a_page_too(fitted: Fitted, tmp_path: Path) -> None:
     code, told = fitted(1000.0 * seen(), *TRACKER, "--report", page)
     assert code == 1
     assert told["sigma"] is None
-    assert "No pose" in page.read_text("utf-8")
+    assert (told["refused_code"], "Correct the unit" in told["remedy"]) == (3011, True)
+    assert "No pose: 3011" in page.read_text("utf-8")
+    assert told["remedy"] in page.read_text("utf-8")
     code, told = fitted(seen(), "--report", tmp_path / "no" / "where.html")
     assert (code, told["error"]["code"]) == (2, 4005)
 
@@ -259,6 +307,15 @@ def test_chi_square_is_put_into_words(
     call(["fit", *map(str, files), "--noise", noise])
     out = capsys.readouterr().out
     assert said in out
+
+
+def test_a_refusal_has_its_code_and_its_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = points(tmp_path / "n.csv", J), points(tmp_path / "m.csv", seen() * [1.0, -1.0, 1.0])
+    assert call(["fit", *map(str, files)]) == 1
+    first, second, *_ = capsys.readouterr().out.splitlines()
+    assert first.startswith("no pose: 3003: fit: ")
+    assert "mirror image" in first
+    assert second.startswith("    -> ")
 
 
 def test_a_person_is_told_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

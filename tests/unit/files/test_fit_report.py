@@ -23,6 +23,7 @@ VECTOR = [100.0, -200.0, 300.0, 1.0, -2.0, 30.0]
 KEYS = {
     "pose", "rms_mm", "max_mm", "used", "rejected", "dropped_readings", "residuals_mm", "refused",
     "method", "covariance", "sigma", "chi2", "dof", "chi2_p", "redundancy", "scale", "swapped",
+    "refused_code", "remedy", "locks_p",
 }  # fmt: skip
 
 

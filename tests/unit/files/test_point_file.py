@@ -39,8 +39,11 @@ def test_passes_are_rows_of_one_name(tmp_path: Path) -> None:
     [
         ("", "empty"),
         ("x,y,z\n1,2,3\n", "line 1"),
-        ("name,x_mm,y_mm,z_mm,sx_mm\n", "line 1"),
-        ("name;x_mm;y_mm;z_mm\n", "line 1"),
+        ("name,x_mm,y_mm,z_mm,sx_mm\n", "missing: sy_mm, sz_mm"),
+        ("name,x_mm,y_mm\nA,1,2\n", "missing: z_mm"),
+        ("name;x_mm;y_mm;z_mm\nA;1,5;2;3\n", "semicolons separate"),
+        ("name\tx_mm\ty_mm\tz_mm\n", "tabs separate"),
+        ("x_mm,y_mm,z_mm,name\n", "not understood"),
         (HEAD + "A,1,2\n", "line 2: 3 fields"),
         (HEAD + "A,1,2,3,4\n", "line 2: 5 fields"),
         (HEAD + "A,1,2,3\n\nB,1,abc,3\n", "line 4, column y_mm: 'abc'"),
