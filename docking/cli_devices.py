@@ -14,14 +14,16 @@ from docking.terminal import (
     Range,
     ask_before,
     json_option,
+    language,
+    notifier,
     print_json,
     print_text,
     transcript_option,
     wire_choice,
 )
+from docking.words import tell
 
 WIRES = "Addresses that `docking sim` wrote; without it --sim starts its own devices."
-SILENCE = "The drives will miss their controller on purpose. Everything stands, braked, and nothing hangs on a servo?"
 CLEAR = "\x1b[H\x1b[J"
 
 
@@ -54,22 +56,25 @@ def devices(
 ) -> int:
     """Say who answers on the wires of a CELL: identity, firmware, state, units, watchdogs, round trip, start skew.
 
-    Reads only, without --prove and --prove-watchdogs. Exits with 0 when every device answers as it should, else with 1
-    and its name.
+    Nothing is enabled or moved; without --prove and --prove-watchdogs positioners are only read. Exits with 0 when every
+    device answers as it should, else with 1 and its name.
 
     \b
     Example: docking devices sim/cells/lab-can.toml --sim
     Example: docking devices cell.toml --prove --transcript bring-up.txt
     """
-    from docking.assemble.commissioning import devices_text, find_devices
+    from docking.assemble.commissioning import Proving, devices_text, find_devices, require_watchdogs
 
-    if prove_watchdogs and not (sim or yes):
-        ask_before(cell, SILENCE)
-    report = find_devices(_request(cell, sim, wires, transcript), prove=prove, watchdogs=prove_watchdogs)
+    request = _request(cell, sim, wires, transcript)
+    if prove_watchdogs:
+        require_watchdogs(request)
+        if not (sim or yes):
+            ask_before("devices --prove-watchdogs", tell(language(), "silence_question"))
+    report = find_devices(request, Proving(prove, prove_watchdogs, notifier(as_json)))
     if as_json:
         print_json(report)
     else:
-        print_text(devices_text(report))
+        print_text(devices_text(report, language()))
     return EXIT_OK if report["ok"] else EXIT_FAULT
 
 
@@ -109,4 +114,4 @@ def monitor(
 def _request(cell: Path, sim: bool, wires: Path | None, transcript: Path | None) -> Any:
     from docking.assemble.looking import LookRequest
 
-    return LookRequest(cell, wire_choice(sim, wires), transcript=transcript)
+    return LookRequest(cell, wire_choice(sim, wires), transcript=transcript, language=language())

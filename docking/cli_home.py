@@ -7,9 +7,18 @@ from pathlib import Path
 import click
 
 from docking.errors import EXIT_OK
-from docking.terminal import FILE, ask_before, json_option, print_json, print_text, transcript_option, wire_choice
-
-WARNING = "The axes move by themselves. Nothing rests on {names}, and everybody is clear of them?"
+from docking.terminal import (
+    FILE,
+    ask_before,
+    json_option,
+    language,
+    notifier,
+    print_json,
+    print_text,
+    transcript_option,
+    wire_choice,
+)
+from docking.words import tell
 
 
 @click.command()
@@ -37,18 +46,20 @@ def home(
     homed. Refused where a load cell shows a component.
 
     \b
+    Example: docking home sim/cells/lab-can-free.toml --sim
     Example: docking home cell.toml --positioner A --positioner B
     """
-    from docking.assemble.homing import HomeRequest, home_axes, home_text
+    from docking.assemble.homing import HomeRequest, home_axes, home_text, homing_plan
     from docking.assemble.looking import LookRequest
 
-    choice = wire_choice(sim, wires)
+    look = LookRequest(cell, wire_choice(sim, wires), transcript=transcript, language=language())
+    request = HomeRequest(look, positioners, free)
+    names = ", ".join(homing_plan(request).positioners)
     if not (sim or yes):
-        ask_before(cell, WARNING.format(names=", ".join(positioners) or "any positioner"))
-    look = LookRequest(cell, choice, transcript=transcript)
-    report = home_axes(HomeRequest(look, positioners, free))
+        ask_before("home", tell(language(), "home_question", names=names))
+    report = home_axes(request, notifier(as_json))
     if as_json:
         print_json(report)
     else:
-        print_text(home_text(report))
+        print_text(home_text(report, language()))
     return EXIT_OK

@@ -7,9 +7,8 @@ from pathlib import Path
 import click
 
 from docking.errors import EXIT_OK
-from docking.terminal import FILE, ask_before, json_option, print_json, print_text, wire_choice
-
-WARNING = "{name} moves, and goes on when this computer falls silent: it has no watchdog. Everybody clear of it?"
+from docking.terminal import FILE, ask_before, json_option, language, notifier, print_json, print_text, wire_choice
+from docking.words import tell
 
 
 @click.command(context_settings={"ignore_unknown_options": True})
@@ -37,14 +36,15 @@ def single(
     Example: docking single cell.toml platform-left 250
     """
     from docking.assemble.looking import LookRequest
-    from docking.assemble.single import move_single
+    from docking.assemble.single import SingleMove, move_single, single_axis
 
-    choice = wire_choice(sim, wires)
+    move = SingleMove(LookRequest(cell, wire_choice(sim, wires), language=language()), name, target_mm, speed)
+    single_axis(move)
     if not (sim or yes):
-        ask_before(cell, WARNING.format(name=name))
-    report = move_single(LookRequest(cell, choice), name, target_mm, speed)
+        ask_before("single", tell(language(), "single_question", name=name, target_mm=target_mm))
+    report = move_single(move, notifier(as_json))
     if as_json:
         print_json(report)
     else:
-        print_text("{axis}: from {before_mm:.2f} to {after_mm:.2f} mm".format(**report))
+        print_text(tell(language(), "single_there", **report))
     return EXIT_OK

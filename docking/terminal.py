@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from docking.errors import BadArgument
+from docking.errors import BadArgument, StoppedByOperator
 
 if TYPE_CHECKING:
     from docking.assemble.requests import WireChoice
 
 FILE = click.Path(path_type=Path)
+YES = frozenset({"y", "yes", "是"})
 
 
 class Range(click.FloatRange):
@@ -70,9 +71,19 @@ def print_json(body: dict[str, Any]) -> None:
     print_text(canonical(body))
 
 
-def ask_before(cell: Path, question: str) -> None:
-    """Ask on stderr and end where the answer is no; a CELL file with problems is told before anybody is asked."""
-    from docking.config.load import load_cell
+def ask_before(command: str, question: str) -> None:
+    """Ask on stderr, in the language of the user. Raises StoppedByOperator for any answer but yes."""
+    from docking.words import tell
 
-    load_cell(cell)
-    click.confirm(question, abort=True, err=True)
+    text = tell(language(), "confirmed", question=question)
+    answer = click.prompt(text, prompt_suffix="", default="", show_default=False, err=True)
+    if answer.strip().lower() not in YES:
+        raise StoppedByOperator(command, "The question was not answered with yes: nothing was done.")
+
+
+def notifier(as_json: bool) -> Callable[..., None]:
+    """`notify(key, **facts)`: progress in the language of the user, on stderr where stdout carries JSON."""
+    from docking.words import tell
+
+    spoken = language()
+    return lambda key, **facts: print_text(tell(spoken, key, **facts), err=as_json)

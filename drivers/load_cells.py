@@ -15,7 +15,7 @@ import numpy as np
 
 from docking.config.cell import CellFile
 from docking.config.inputs import ForceInput
-from docking.config.wired_forces import wired_forces
+from docking.config.wired_forces import load_cell_ranges_n, wired_forces
 from docking.errors import BadReply, DeviceSilent, DockingError, LoadCellBroken
 from docking.types import Array, Identity, readonly
 from drivers.inputs import InputModule
@@ -24,6 +24,19 @@ MEASURING_MA = (3.8, 20.5)
 FAILED_MA = (3.6, 21.0)
 MIDDLE_MA, HALF_SPAN_MA = 12.0, 8.0
 READY_S = 1.0
+
+
+def current_ma(force: ForceInput, counts: int) -> float:
+    """The current (mA) of an input that reads `counts`."""
+    low, high = force.counts
+    return 4.0 + 16.0 * (counts - low) / (high - low)
+
+
+def measured_n(force: ForceInput, range_n: float, counts: int | None) -> float:
+    """The force (N) of an input that reads `counts` (None: a broken wire), NaN where the current means none."""
+    ma = float("nan") if counts is None else current_ma(force, counts)
+    known = MEASURING_MA[0] <= ma <= MEASURING_MA[1]
+    return range_n * (ma - MIDDLE_MA) / HALF_SPAN_MA if known else float("nan")
 
 
 @dataclass(frozen=True)
@@ -37,10 +50,6 @@ class _Component:
     force: ForceInput
     range_n: float
 
-    def current_ma(self, counts: int) -> float:
-        low, high = self.force.counts
-        return 4.0 + 16.0 * (counts - low) / (high - low)
-
     def read(self) -> tuple[float, DockingError | None]:
         """Force in N, NaN with the reason where there is none."""
         nothing = float("nan")
@@ -52,7 +61,7 @@ class _Component:
             return nothing, LoadCellBroken(
                 where, "The module reports a broken wire.", value="no current", limit="4..20 mA"
             )
-        ma = self.current_ma(counts)
+        ma = current_ma(self.force, counts)
         if not FAILED_MA[0] <= ma <= FAILED_MA[1]:
             cause = (
                 "Wire broken or without supply."
@@ -62,7 +71,7 @@ class _Component:
             return nothing, LoadCellBroken(where, cause, value=f"{ma:.2f} mA", limit="4..20 mA")
         if not MEASURING_MA[0] <= ma <= MEASURING_MA[1]:
             return nothing, LoadCellBroken(where, "Beyond its range.", value=f"{ma:.2f} mA", limit="4..20 mA")
-        return self.range_n * (ma - MIDDLE_MA) / HALF_SPAN_MA, None
+        return measured_n(self.force, self.range_n, counts), None
 
 
 class AnalogueLoadCells:
@@ -134,12 +143,11 @@ class AnalogueLoadCells:
 
 
 def _components(cell: CellFile, modules: Mapping[str, InputModule]) -> tuple[_Component, ...]:
-    ranges = cell.load_cells.range_n if cell.load_cells is not None else (float("nan"),) * 3
     return tuple(
         _Component(cell.axis_names.index(axis), axis, modules[force.module], channel, force, range_n)
         for force in wired_forces(cell)
         for axis, channel, range_n in zip(
-            (f"{force.positioner}.{name}" for name in "XYZ"), force.channels, ranges, strict=True
+            (f"{force.positioner}.{name}" for name in "XYZ"), force.channels, load_cell_ranges_n(cell), strict=True
         )
     )
 

@@ -52,7 +52,7 @@ class Instrument:
         self._up: Array = -gravity_unit(cell)
         self._cone_cos = float(np.cos(np.deg2rad(truth.instrument.search_cone_deg)))
         names = plant.target_names()
-        self._index = {name: i for i, name in enumerate(names)}
+        self._index = {name: i for i, name in enumerate(names) if name not in plant.absent}
         self._seating_mm = draws.span("seating", truth.seating.sigma_um, (len(names),)) * 1e-3
         self._gross, self._fast = truth.gross_errors, truth.fast_outliers
         self._unseated: Array = self._draw_unseated(len(names))

@@ -39,6 +39,7 @@ class Plant:
     def __init__(self, cell: CellFile, job: JobFile, truth: TruthFile, seed: int) -> None:
         """Raises ConfigInvalid when a socket would have to stand outside its stroke, or names repeat."""
         draws = Draws(truth, seed)
+        self._loaded = truth.part_on_balls
         self.axes: tuple[str, ...] = cell.axis_names
         self.drives = truth.drives
         self._component = ComponentShape(cell, job, truth, draws)
@@ -131,9 +132,7 @@ class Plant:
 
         NaN where no load cell is fitted. Every call draws fresh noise.
         """
-        elapsed = self.elapsed_s(self._t_s)
-        self._refresh(elapsed)
-        return self._load_cells.read_n(self._equilibrium.force_n, elapsed)
+        return self._load_cells.read_n(self.true_axis_forces_n(), self.elapsed_s(self._t_s))
 
     def target_names(self) -> tuple[str, ...]:
         """All reflectors: ERS points, mate and component targets, check points, measured features (NAME.C, NAME.M)."""
@@ -181,6 +180,8 @@ class Plant:
 
     def true_axis_forces_n(self) -> Array:
         """True forces (m,) on the component along each axis, without load-cell errors."""
+        if not self._loaded:
+            return readonly(np.zeros(len(self.axes)))
         self._refresh(self.elapsed_s(self._t_s))
         return readonly(self._equilibrium.force_n)
 
@@ -314,6 +315,8 @@ class Plant:
 
     def _carries(self, index: int) -> bool:
         """True while the vertical axis `index` bears load."""
+        if not self._loaded:
+            return False
         self._solve(self.elapsed_s(self._t_s))
         upward = -self._supports.rows[index] @ self._down * self._equilibrium.force_n[index]
         return bool(upward > 0.0)
@@ -327,6 +330,8 @@ class Plant:
         features = [job.component.features[i].name for i in self._seen_features]
         names = tuple(e.name for e in cell.tracker.ers) + self._mate.target_names + self._component.target_names
         names += tuple(f"{name}.C" for name in features) + tuple(f"{name}.M" for name in features)
+        of_part = (*self._component.target_names, *(f"{name}.C" for name in features))
+        self.absent: frozenset[str] = frozenset() if self._loaded else frozenset(of_part)
         self._row = {name: i for i, name in enumerate(names)}
         if len(self._row) != len(names):
             repeated = sorted({n for n in names if names.count(n) > 1})

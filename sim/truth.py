@@ -194,7 +194,8 @@ class Misalignment(Model):
 
 class Drives(Model):
     """Servo drives and brakes as they really are; drives on CAN react as `sync_loss` says to `sync_loss_cycles` without
-    SYNC, and have these `modes`. `follower_friction` is of the force that a force-controlled axis holds."""
+    SYNC, and have these `modes`; where they are not `homed` they count `zero_off_mm` too much until they are.
+    `follower_friction` is of the force that a force-controlled axis holds."""
 
     servo_lag_s: Positive
     servo_lag_spread: NonNegative
@@ -209,6 +210,8 @@ class Drives(Model):
     sync_loss_cycles: Positive = 3.0
     watchdog_scatter_s: NonNegative = 0.0
     modes: tuple[int, ...] = (6, 8, 10)
+    homed: bool = True
+    zero_off_mm: float = 0.0
 
 
 class InstrumentTruth(Model):
@@ -219,10 +222,12 @@ class InstrumentTruth(Model):
 
 
 class TruthFile(Model):
-    """The whole truth file."""
+    """The whole truth file. Without a part on the balls (`part_on_balls`) the positioners stand free where they would
+    carry it: the load cells read nothing, and no reflector of the part is seen."""
 
     schema_version: Literal[1]
     name: Name
+    part_on_balls: bool = True
     errors: dict[str, NonNegative]
     drives: Drives
     instrument: InstrumentTruth

@@ -9,14 +9,16 @@ from datetime import date
 from typing import Any
 
 from docking.assemble.controller import tracker_of
-from docking.assemble.looking import Ends, LookRequest, load_looked_at, wires_of
+from docking.assemble.looking import Ends, LookRequest, Notify, load_looked_at, unheard, wires_of
 from docking.assemble.real_time import run_real
 from docking.assemble.single import look_at_singles
+from docking.assemble.streams import sensors_of
 from docking.assemble.timed import TimedCan, TimedSerial
 from docking.config import CellFile
 from docking.config.cell import CanBus
 from docking.errors import BadArgument, DockingError, LinkError, LinkLost
-from docking.ports import CanLink
+from docking.ports import CanLink, InertialSensor, PointStream
+from docking.words import tell
 from drivers.canopen.look import BusLook
 from drivers.canopen.positioners import CanopenPositioners
 from drivers.look import Found
@@ -28,20 +30,42 @@ PROVE_S = 1.0
 """How long the read-backs of a bus are timed."""
 
 
-def find_devices(request: LookRequest, *, prove: bool = False, watchdogs: bool = False) -> dict[str, Any]:
-    """Everything that `docking devices` says, as plain data. Raises ConfigError.
+@dataclass(frozen=True)
+class Proving:
+    """What is done beside looking: `settings` of positioners are written and read back as before a docking, nothing is
+    enabled; for their `watchdogs` the heartbeat of a CAN bus is withheld besides, until every drive has missed it.
+    `notify` tells the person at the machine."""
 
-    With `prove` the settings of positioners are written and read back as before a docking; nothing is enabled. With
-    `watchdogs` the heartbeat of a CAN bus is withheld besides, until every drive has missed it.
-    """
+    settings: bool = False
+    watchdogs: bool = False
+    notify: Notify = unheard
+
+    @property
+    def wanted(self) -> bool:
+        return self.settings or self.watchdogs
+
+
+LOOKING = Proving()
+
+
+def require_watchdogs(request: LookRequest) -> None:
+    """Raises BadArgument where the positioners of the cell have no watchdogs to prove, ConfigError."""
     cell = load_looked_at(request)
-    if watchdogs and not isinstance(cell.bus, CanBus):
+    if not isinstance(cell.bus, CanBus):
         cause = "a CANopen bus: PLCs are not left without their host"
         raise BadArgument("--prove-watchdogs", cause, value=cell.bus.kind)
+
+
+def find_devices(request: LookRequest, proving: Proving = LOOKING) -> dict[str, Any]:
+    """Everything that `docking devices` says, as plain data. Raises ConfigError, and as `require_watchdogs`."""
+    cell = load_looked_at(request)
+    if proving.watchdogs:
+        require_watchdogs(request)
 
     async def main() -> dict[str, Any]:
         async with wires_of(request, cell) as ends:
             rows = [await _tracker(cell, ends)]
+            rows += [await _sensor(*sensor) for sensor in sensors_of(cell, request.cell_path.parent, ends.found)]
             skew = None
             if ends.bus.can is not None:
                 rows += await _bus(cell, ends.bus.can)
@@ -53,11 +77,12 @@ def find_devices(request: LookRequest, *, prove: bool = False, watchdogs: bool =
                 look.close()
             rows += await look_at_singles(cell, ends)
             alone = not any(found.where == STRANGER and found.address == "SYNC" for found in rows)
-            if not (prove or watchdogs) or not alone:
-                return _report(cell, rows, skew, _Proof(None if alone or not (prove or watchdogs) else _occupied()))
-            return _report(cell, rows, skew, await _prove(cell, ends, watchdogs))
+            proof = _UNPROVED
+            if proving.wanted:
+                proof = await _prove(cell, ends, proving) if alone else _Proof(_occupied())
+            return _report(cell, rows, skew, proof, request.language)
 
-    return run_real(main, ticks=prove or watchdogs)
+    return run_real(main, ticks=proving.wanted)
 
 
 @dataclass(frozen=True)
@@ -91,6 +116,18 @@ async def _tracker(cell: CellFile, ends: Ends) -> Found:
     return Found("tracker", address, identity, "", "", "", tuple(timed.taken_s), problem)
 
 
+async def _sensor(where: str, port: str, sensor: PointStream | InertialSensor) -> Found:
+    """A sensor that streams beside the tracker, brought up as before a docking and released."""
+    identity, problem = None, None
+    try:
+        identity = await sensor.connect()
+    except DockingError as error:
+        problem = error
+    finally:
+        await sensor.close()
+    return Found(where, port, identity, problem=problem)
+
+
 async def _bus(cell: CellFile, link: CanLink) -> tuple[Found, ...]:
     look = BusLook(cell, link)
     try:
@@ -105,7 +142,7 @@ async def _bus(cell: CellFile, link: CanLink) -> tuple[Found, ...]:
     return found
 
 
-async def _prove(cell: CellFile, ends: Ends, watchdogs: bool) -> _Proof:
+async def _prove(cell: CellFile, ends: Ends, proving: Proving) -> _Proof:
     """Bring the positioners up as before a docking, enable nothing, release them."""
     positioners: CanopenPositioners | ModbusPositioners
     timed: TimedCan | None = None
@@ -116,10 +153,12 @@ async def _prove(cell: CellFile, ends: Ends, watchdogs: bool) -> _Proof:
     else:
         positioners = ModbusPositioners(cell, ends.bus.modbus, ends.tap, ends.bus.line)
     problem, missed_s = None, None
+    proving.notify("bringing_up")
     try:
         await positioners.bring_up()
         await asyncio.sleep(PROVE_S if timed is not None else 0.0)
-        if watchdogs and isinstance(positioners, CanopenPositioners):
+        if proving.watchdogs and isinstance(positioners, CanopenPositioners):
+            proving.notify("silence")
             missed_s = await positioners.prove_watchdogs()
     except DockingError as error:
         problem = error
@@ -136,10 +175,14 @@ async def _prove(cell: CellFile, ends: Ends, watchdogs: bool) -> _Proof:
 
 # what is told ------------------------------------------------------------------------------------------------------
 def _report(
-    cell: CellFile, rows: list[Found], skew_s: tuple[float, float] | None, proved: _Proof = _UNPROVED
+    cell: CellFile,
+    rows: list[Found],
+    skew_s: tuple[float, float] | None,
+    proved: _Proof = _UNPROVED,
+    language: str = "en",
 ) -> dict[str, Any]:
     proof, skew = proved.problem, skew_s or proved.skew_s
-    devices = [_row(found) for found in rows]
+    devices = [_row(found, language) for found in rows]
     due = cell.tracker.calibration_due
     today = date.today()
     warnings = []
@@ -158,12 +201,16 @@ def _report(
         "start_skew_known_to_ms": None if skew is None else 1e3 * skew[1],
         "calibration_due": str(due) if due is not None else None,
         "watchdogs_ms": {name: 1e3 * s for name, s in proved.missed_s.items()} if proved.missed_s else None,
-        "bring_up": None if proof is None else {"code": proof.code, "message": proof.text(), "where": proof.where},
+        "bring_up": None if proof is None else {**_problem(proof, language), "where": proof.where},
         "warnings": warnings,
     }
 
 
-def _row(found: Found) -> dict[str, Any]:
+def _problem(error: DockingError, language: str) -> dict[str, Any]:
+    return {"code": error.code, "message": error.text(language), "remedy": error.remedy(language)}
+
+
+def _row(found: Found, language: str) -> dict[str, Any]:
     identity, taken = found.identity, found.round_trips_s
     problem = found.problem
     return {
@@ -180,11 +227,11 @@ def _row(found: Found) -> dict[str, Any]:
         "watchdog": found.watchdog or None,
         "round_trip_ms": 1e3 * statistics.median(taken) if taken else None,
         "round_trip_max_ms": 1e3 * max(taken) if taken else None,
-        "problem": None if problem is None else {"code": problem.code, "message": problem.text()},
+        "problem": None if problem is None else _problem(problem, language),
     }
 
 
-def devices_text(report: dict[str, Any]) -> str:
+def devices_text(report: dict[str, Any], language: str = "en") -> str:
     """The same for people: two or three lines a device, then what is wrong."""
     lines = []
     for row in report["devices"]:
@@ -198,17 +245,20 @@ def devices_text(report: dict[str, Any]) -> str:
         lines += [f"      {fact}" for fact in facts if fact]
         if row["problem"]:
             lines.append(f"      {row['problem']['code']}: {row['problem']['message']}")
+            lines.append(f"      -> {row['problem']['remedy']}")
     skew = report["start_skew_ms"]
     if skew is not None:
         lines.append(f"start skew as measured: {skew:.2f} ms, known to {report['start_skew_known_to_ms']:.2f} ms")
     if report["watchdogs_ms"]:
         took = report["watchdogs_ms"].values()
-        lines.append(f"every drive missed the heartbeat by itself, after {min(took):.0f} to {max(took):.0f} ms")
+        lines.append(tell(language, "missed", first_ms=min(took), last_ms=max(took)))
     if report["calibration_due"]:
         lines.append(f"calibration of the instrument due: {report['calibration_due']}")
-    if report["bring_up"]:
-        lines.append(f"bring-up refused: {report['bring_up']['code']}: {report['bring_up']['message']}")
+    if refused := report["bring_up"]:
+        what, remedy = refused["message"], refused["remedy"]
+        lines.append(tell(language, "bring_up_refused", code=refused["code"], error=what, remedy=remedy))
     lines += [f"warning: {text}" for text in report["warnings"]]
-    missing = ", ".join(report["missing"])
-    lines.append("every device of the cell answers as it should" if report["ok"] else f"NOT IN ORDER: {missing}")
+    amiss = [*report["missing"], *([report["bring_up"]["where"]] if report["bring_up"] else [])]
+    verdict = tell(language, "all_answer") if report["ok"] else tell(language, "not_in_order", names=", ".join(amiss))
+    lines.append(verdict)
     return "\n".join(lines)

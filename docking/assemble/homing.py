@@ -6,17 +6,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from docking.assemble.looking import Ends, LookRequest, load_looked_at, wires_of
+from docking.assemble.looking import Ends, LookRequest, Notify, load_looked_at, unheard, wires_of
 from docking.assemble.motion_side import input_modules
 from docking.assemble.real_time import on_interrupt, run_real
 from docking.config import CellFile
 from docking.config.cell import CanBus, HomingConfig
 from docking.config.inputs import InputsConfig, Use
 from docking.errors import BadArgument, ConfigInvalid, DockingError, HomingRefused
+from docking.words import tell
 from drivers.canopen.homing import method_of
 from drivers.canopen.positioners import CanopenPositioners
 from drivers.canopen.shared import SharedCan
 from drivers.inputs import WiredInputs
+from drivers.load_cells import AnalogueLoadCells
+from drivers.weighed_axes import WeighedDrives
 
 STOPS: tuple[Use, ...] = ("emergency-stop", "protective-stop")
 
@@ -30,24 +33,37 @@ class HomeRequest:
     free: bool = False
 
 
-def home_axes(request: HomeRequest) -> dict[str, Any]:
+@dataclass(frozen=True)
+class HomingPlan:
+    """What is going to happen: which axes of which positioners of the cell, and how."""
+
+    cell: CellFile
+    homing: HomingConfig
+    positioners: tuple[str, ...]
+    axes: tuple[str, ...]
+
+
+def home_axes(request: HomeRequest, notify: Notify = unheard) -> dict[str, Any]:
     """Bring the positioners up, home the group, release them; what was done, as plain data.
 
-    Raises ConfigError; HomingRefused where a positioner has no load cell and nobody has said that it is free, or where
-    a stop is pressed; else as `CanopenPositioners.home`.
+    Raises as `homing_plan`; HomingRefused where a load cell shows a component or a stop is pressed; else as
+    `CanopenPositioners.home`.
     """
-    cell = load_looked_at(request.look)
-    homing, group = _group(cell, request)
+    plan = homing_plan(request)
 
     async def main() -> dict[str, Any]:
-        async with wires_of(request.look, cell) as ends:
-            return await _home(cell, homing, group, ends)
+        async with wires_of(request.look, plan.cell) as ends:
+            return await _home(plan, ends, notify)
 
     return run_real(main)
 
 
-def _group(cell: CellFile, request: HomeRequest) -> tuple[HomingConfig, tuple[str, ...]]:
-    """How, and which axes. Raises as `home_axes`."""
+def homing_plan(request: HomeRequest) -> HomingPlan:
+    """What `home_axes` would do; nothing is opened.
+
+    Raises ConfigError; HomingRefused where a positioner has no load cell and nobody has said that it is free.
+    """
+    cell = load_looked_at(request.look)
     if not isinstance(cell.bus, CanBus):
         raise BadArgument("home", "positioner PLCs home their axes themselves", value=cell.bus.kind)
     if cell.homing is None:
@@ -61,19 +77,18 @@ def _group(cell: CellFile, request: HomeRequest) -> tuple[HomingConfig, tuple[st
     if unseen and not request.free:
         cause = "It has no load cell: somebody must say that nothing rests on it (--free)."
         raise HomingRefused(f"positioner {unseen[0]}", cause, value="not said", limit="free")
-    return cell.homing, tuple(f"{p.name}.{axis.name}" for p in chosen for axis in p.axes if axis.driven)
+    axes = tuple(f"{p.name}.{axis.name}" for p in chosen for axis in p.axes if axis.driven)
+    return HomingPlan(cell, cell.homing, tuple(p.name for p in chosen), axes)
 
 
-async def _home(cell: CellFile, homing: HomingConfig, group: tuple[str, ...], ends: Ends) -> dict[str, Any]:
+async def _home(plan: HomingPlan, ends: Ends, notify: Notify) -> dict[str, Any]:
+    cell = plan.cell
     if ends.bus.can is None:
         raise BadArgument("home", "a CAN bus", value=cell.bus.kind)
-    shared = SharedCan(ends.bus.can)
-    positioners = CanopenPositioners(cell, shared.end())
-    inputs = None
-    if cell.inputs is not None:
-        inputs = WiredInputs(cell.inputs, input_modules(cell.inputs, shared, ends.bus.modbus, ends.tap))
+    positioners, inputs = _drivers(cell, ends, SharedCan(ends.bus.can))
     asked: list[str] = []
     on_interrupt(lambda: asked.append("Somebody interrupted it."))
+    notify("bringing_up")
     try:
         await positioners.bring_up()
         if inputs is not None:
@@ -82,7 +97,8 @@ async def _home(cell: CellFile, homing: HomingConfig, group: tuple[str, ...], en
         if reason := stop():
             raise HomingRefused(cell.name, reason, value="stop", limit="no stop")
         before = positioners.latest().position_mm.tolist()
-        await positioners.home(group, stop)
+        notify("homing", axes=", ".join(plan.axes))
+        await positioners.home(plan.axes, stop)
         after = positioners.latest().position_mm.tolist()
     finally:
         if inputs is not None:
@@ -90,11 +106,22 @@ async def _home(cell: CellFile, homing: HomingConfig, group: tuple[str, ...], en
         await _release(positioners)
     axes = {f"{p.name}.{axis.name}": axis for p in cell.positioners for axis in p.axes}
     rows = [
-        {"axis": name, "method": method_of(axes[name], homing), "before_mm": a, "after_mm": b}
+        {"axis": name, "method": method_of(axes[name], plan.homing), "before_mm": a, "after_mm": b}
         for name, a, b in zip(cell.axis_names, before, after, strict=True)
-        if name in group
+        if name in plan.axes
     ]
     return {"cell": cell.name, "homed": rows, "not_homed": sorted(positioners.unhomed)}
+
+
+def _drivers(cell: CellFile, ends: Ends, shared: SharedCan) -> tuple[CanopenPositioners, WiredInputs | None]:
+    """The drives, with load cells that are wired elsewhere, and the contacts."""
+    end = shared.end()
+    if cell.inputs is None:
+        return CanopenPositioners(cell, end), None
+    modules = input_modules(cell.inputs, shared, ends.bus.modbus, ends.tap)
+    weighing = {name: modules.pop(name) for name in sorted(cell.inputs.weighing)}
+    drives = WeighedDrives(cell, end, AnalogueLoadCells(cell, weighing)) if weighing else CanopenPositioners(cell, end)
+    return drives, WiredInputs(cell.inputs, modules)
 
 
 async def _release(positioners: CanopenPositioners) -> None:
@@ -120,7 +147,7 @@ def _stops(asked: list[str], inputs: WiredInputs | None, config: InputsConfig | 
     return reason
 
 
-def home_text(report: dict[str, Any]) -> str:
+def home_text(report: dict[str, Any], language: str = "en") -> str:
     """The same for people."""
     lines = [f"{'axis':<8}{'method':>8}{'before mm':>14}{'after mm':>14}"]
     lines += [
@@ -128,5 +155,5 @@ def home_text(report: dict[str, Any]) -> str:
         for row in report["homed"]
     ]
     left = ", ".join(report["not_homed"])
-    lines.append(f"still not homed: {left}" if left else "every axis knows its zero")
+    lines.append(tell(language, "not_homed", axes=left) if left else tell(language, "homed"))
     return "\n".join(lines)

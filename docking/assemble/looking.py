@@ -21,12 +21,22 @@ from drivers.links.serial_port import SerialPort
 
 @dataclass(frozen=True)
 class LookRequest:
-    """Which cell is looked at, over which wires; `seed` of simulated devices, where the transcript goes."""
+    """Which cell is looked at, over which wires; `seed` of simulated devices, where the transcript goes, in which
+    language problems are told."""
 
     cell_path: Path
     wires: WireChoice
     seed: int = 1
     transcript: Path | None = None
+    language: str = "en"
+
+
+Notify = Callable[..., None]
+"""`notify(key, **facts)`: a text of `docking.words` for the person at the machine."""
+
+
+def unheard(key: str, **facts: object) -> None:
+    """Where nobody listens."""
 
 
 @dataclass(frozen=True)

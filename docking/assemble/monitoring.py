@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from docking.assemble.looking import Ends, LookRequest, load_looked_at, wires_of
@@ -12,7 +13,9 @@ from docking.assemble.real_time import on_interrupt, run_real
 from docking.config import CellFile
 from docking.config.cell import CanBus
 from docking.config.inputs import InputsConfig
+from docking.config.wired_forces import load_cell_ranges_n, wired_forces
 from drivers.canopen.look import BusLook
+from drivers.load_cells import measured_n
 from drivers.look import AxisValue
 from drivers.modbus_look import ModbusLook
 
@@ -75,12 +78,25 @@ async def _values(cell: CellFile, bus: BusLook | None, modbus: ModbusLook) -> di
     levels: dict[str, tuple[bytes, tuple[int | None, ...]]] = dict(await modbus.inputs())
     if bus is not None:
         levels |= await bus.inputs()
+    wired_n = _wired_forces(cell, levels)
+    axes = tuple(replace(axis, force_n=wired_n.get(axis.axis, axis.force_n)) for axis in axes)
     return {
         "cell": cell.name,
         "read_by": ("listening to the controller" if bus.controlled else "SDO") if bus is not None else "Modbus",
         "axes": [_axis(axis) for axis in axes],
         **(_inputs(cell.inputs, levels) if cell.inputs is not None else {"inputs": {}, "temperatures_c": {}}),
     }
+
+
+def _wired_forces(cell: CellFile, levels: Levels) -> dict[str, float]:
+    """What load cells on I/O modules read, by axis; NaN where that means no force."""
+    found = {}
+    for force in wired_forces(cell):
+        _, counts = levels.get(force.module, (b"", ()))
+        for name, channel, range_n in zip("XYZ", force.channels, load_cell_ranges_n(cell), strict=True):
+            value = counts[channel] if channel < len(counts) else None
+            found[f"{force.positioner}.{name}"] = measured_n(force, range_n, value)
+    return found
 
 
 def _axis(value: AxisValue) -> dict[str, Any]:

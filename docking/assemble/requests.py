@@ -166,8 +166,8 @@ def read_wires(path: Path, cell: CellFile) -> dict[str, Any]:
     whole = isinstance(listed, dict) and set(listed) == expected and (queued or _has_buses(cell, found))
     _refuse_real_devices(path, found)
     serial = ["tracker"]
-    if cell.live is not None:
-        serial += ["camera", *(["inertial"] if cell.inertial is not None else [])]
+    serial += ["camera"] if cell.camera is not None or cell.stereo is not None else []
+    serial += ["inertial"] if cell.inertial is not None else []
     if not (whole and all(isinstance(found.get(name), str) for name in serial)):
         cause = "the file lacks addresses of this cell; let `docking sim` write it"
         raise BadArgument("--wires", cause, value=str(path))

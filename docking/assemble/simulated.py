@@ -90,6 +90,8 @@ class FarEnd:
             shared_cpu=shared_cpu,
             watchdog_scatter_s=drives.watchdog_scatter_s,
             supported_modes=sum(1 << (mode - 1) for mode in drives.modes),
+            homed=drives.homed,
+            zero_off_mm=drives.zero_off_mm,
         )
         modules = [m for m in cell.inputs.modules if isinstance(m, CanModule)] if cell.inputs else []
         shared = SharedEnd(wire)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 from collections.abc import AsyncIterator
+from dataclasses import dataclass
 from typing import Any
 
-from docking.assemble.looking import Ends, LookRequest, load_looked_at, wires_of
+from docking.assemble.looking import Ends, LookRequest, Notify, load_looked_at, unheard, wires_of
 from docking.assemble.real_time import run_real
 from docking.config import CellFile
 from docking.config.cell import SingleAxis
@@ -21,12 +23,23 @@ MARGIN_S = 2.0
 """By which a move may outlast its way at its speed."""
 
 
-def move_single(request: LookRequest, name: str, target_mm: float, speed_mm_s: float | None = None) -> dict[str, Any]:
-    """Move one single axis to `target_mm` and wait until it says that it is there.
+@dataclass(frozen=True)
+class SingleMove:
+    """One move of one single axis, its speed (mm/s) that of the cell file where none is given."""
 
-    Raises BadArgument for an axis, target or speed that is not in the cell, ConfigError, and as `NumericalDrive.move`.
+    look: LookRequest
+    name: str
+    target_mm: float
+    speed_mm_s: float | None = None
+
+
+def single_axis(move: SingleMove) -> tuple[CellFile, SingleAxis, float]:
+    """The cell, the axis and the speed (mm/s) of a move; nothing is opened.
+
+    Raises ConfigError, BadArgument for an axis, target or speed that is not in the cell.
     """
-    cell = load_looked_at(request)
+    name, target_mm, speed_mm_s = move.name, move.target_mm, move.speed_mm_s
+    cell = load_looked_at(move.look)
     axis = _axis(cell, name)
     speed = axis.v_mm_s if speed_mm_s is None else speed_mm_s
     low, high = axis.stroke_mm
@@ -34,12 +47,28 @@ def move_single(request: LookRequest, name: str, target_mm: float, speed_mm_s: f
         raise BadArgument(f"{name}, target", f"{low:g} to {high:g}", value=target_mm)
     if not (0.0 < speed <= axis.v_mm_s):
         raise BadArgument(f"{name}, speed", f"above 0 to {axis.v_mm_s:g}", value=speed)
+    return cell, axis, speed
+
+
+def move_single(move: SingleMove, notify: Notify = unheard) -> dict[str, Any]:
+    """Move one single axis and wait until it says that it is there.
+
+    Nothing reaches an axis on its way: who interrupts, or meets an error then, is told that it may go on. Raises as
+    `single_axis` and `NumericalDrive.move`.
+    """
+    cell, axis, speed = single_axis(move)
+    name, target_mm = move.name, move.target_mm
 
     async def main() -> dict[str, Any]:
-        async with wires_of(request, cell) as ends, _drive(axis, ends) as drive:
+        async with wires_of(move.look, cell) as ends, _drive(axis, ends) as drive:
             before = await drive.read()
             within_s = abs(target_mm - before.position_mm) / speed + speed / axis.a_mm_s2 + MARGIN_S
-            after = await drive.move(target_mm, speed, 1e-3 * axis.a_mm_s2, within_s)
+            notify("single_moving", name=name, before_mm=before.position_mm, target_mm=target_mm, speed_mm_s=speed)
+            try:
+                after = await drive.move(target_mm, speed, 1e-3 * axis.a_mm_s2, within_s)
+            except (asyncio.CancelledError, DockingError):
+                notify("single_goes_on", name=name, target_mm=target_mm)
+                raise
             return {"axis": name, "before_mm": before.position_mm, "after_mm": after.position_mm, "speed_mm_s": speed}
 
     return run_real(main, ticks=False)

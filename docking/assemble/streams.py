@@ -9,7 +9,7 @@ from pathlib import Path
 from docking.assemble.simulated import FarEnd
 from docking.config import CellFile, JobFile
 from docking.config.base import PoseVector
-from docking.config.instruments import NdiConfig
+from docking.config.instruments import InertialConfig, NdiConfig
 from docking.config.live import StereoConfig
 from docking.errors import BadArgument, FileUnreadable
 from docking.live import LiveStreams
@@ -113,17 +113,17 @@ def virtual_streams(cell: CellFile, job: JobFile, folder: Path, far: FarEnd) -> 
 
 
 def stream_wires(cell: CellFile, job: JobFile, folder: Path, far: FarEnd) -> dict[str, str]:
-    """The same on pseudo-terminals; where they are, nothing for a cell without `[live]`."""
-    if cell.live is None:
-        return {}
-    wire: PtySerial = SteadyPty(far.loop, (cell.stereo or _camera(cell)).baud)
-    wire.open()
-    if cell.stereo is not None:
-        simulated_pair(cell, job, far, wire)
-    else:
-        simulated_camera(cell, job, folder, far, wire)
-    far.devices.append(wire)
-    found = {"camera": wire.path}
+    """The same on pseudo-terminals, each that the cell file has; where they are."""
+    found = {}
+    if (config := cell.stereo or cell.camera) is not None:
+        wire: PtySerial = SteadyPty(far.loop, config.baud)
+        wire.open()
+        if cell.stereo is not None:
+            simulated_pair(cell, job, far, wire)
+        else:
+            simulated_camera(cell, job, folder, far, wire)
+        far.devices.append(wire)
+        found["camera"] = wire.path
     if cell.inertial is not None:
         wire = PtySerial(far.loop, cell.inertial.baud)
         wire.open()
@@ -135,15 +135,45 @@ def stream_wires(cell: CellFile, job: JobFile, folder: Path, far: FarEnd) -> dic
 
 def streams_of(cell: CellFile, folder: Path, found: Mapping[str, object]) -> LiveStreams:
     """The sensors of the cell file, on their ports or on those of simulated devices."""
-
-    def link(name: str, port: str, baud: int, what: str) -> SerialPort:
-        return SerialPort(str(found.get(name, port)), baud, what)
-
-    port = link("camera", (cell.stereo or _camera(cell)).port, _first_baud(cell), CAMERA)
-    streams = LiveStreams(pair_of(cell.stereo, port) if cell.stereo is not None else camera_of(cell, folder, port))
+    streams = LiveStreams(_camera_at(cell, folder, camera_port(cell, found)))
     if cell.inertial is not None:
-        streams.inertial = inertial_of(cell, link("inertial", cell.inertial.port, cell.inertial.baud, INERTIAL))
+        streams.inertial = _inertial_at(cell, cell.inertial, inertial_port(cell.inertial, found))
     return streams
+
+
+Sensor = tuple[str, str, PointStream | InertialSensor]
+
+
+def sensors_of(cell: CellFile, folder: Path, found: Mapping[str, object]) -> list[Sensor]:
+    """Every sensor of the cell file that streams, whether `[live]` uses it or not: name, port, driver.
+
+    Raises FileUnreadable for a tool definition that cannot be read.
+    """
+    sensors: list[Sensor] = []
+    if cell.stereo is not None or cell.camera is not None:
+        port = camera_port(cell, found)
+        sensors.append((CAMERA, port, _camera_at(cell, folder, port)))
+    if cell.inertial is not None:
+        port = inertial_port(cell.inertial, found)
+        sensors.append((INERTIAL, port, _inertial_at(cell, cell.inertial, port)))
+    return sensors
+
+
+def camera_port(cell: CellFile, found: Mapping[str, object]) -> str:
+    return str(found.get("camera", (cell.stereo or _camera(cell)).port))
+
+
+def inertial_port(config: InertialConfig, found: Mapping[str, object]) -> str:
+    return str(found.get("inertial", config.port))
+
+
+def _camera_at(cell: CellFile, folder: Path, port: str) -> PointStream:
+    link = SerialPort(port, _first_baud(cell), CAMERA)
+    return pair_of(cell.stereo, link) if cell.stereo is not None else camera_of(cell, folder, link)
+
+
+def _inertial_at(cell: CellFile, config: InertialConfig, port: str) -> InertialSensor:
+    return inertial_of(cell, SerialPort(port, config.baud, INERTIAL))
 
 
 def _camera(cell: CellFile) -> NdiConfig:

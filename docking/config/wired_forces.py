@@ -11,6 +11,11 @@ def wired_forces(cell: CellFile) -> tuple[ForceInput, ...]:
     return cell.inputs.forces if cell.inputs is not None else ()
 
 
+def load_cell_ranges_n(cell: CellFile) -> tuple[float, float, float]:
+    """Ranges (N) of the load cells along the three axes, NaN where the cell has none."""
+    return cell.load_cells.range_n if cell.load_cells is not None else (float("nan"),) * 3
+
+
 def as_axes_know_it(cell: CellFile) -> CellFile:
     """The cell as its axis controllers know it: a load cell on an I/O module is none of theirs."""
     elsewhere = {force.positioner for force in wired_forces(cell)}

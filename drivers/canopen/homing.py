@@ -13,6 +13,7 @@ from typing import Final
 
 from docking.config.cell import AxisConfig, HomingConfig
 from docking.errors import DockingError, HomingFailed, HomingRefused, WrongIdentity
+from docking.types import Array
 from drivers.canopen import cia402
 from drivers.canopen.bring_up import NodeBringUp
 from drivers.canopen.cia402 import DriveState, Goal
@@ -32,7 +33,8 @@ OFFSET_MM = 0.01
 @dataclass(frozen=True)
 class HomingRules:
     """What homing rests on. `step` lets a cycle pass; `trouble(indices)` names the first axis that is not well and says
-    why; `asked_to_stop()` says why the group is to halt. Both None to go on."""
+    why; `asked_to_stop()` says why the group is to halt. Both None to go on. `forces_n()` (m,) is what the load cells
+    read, wherever they are wired; NaN where that is not known."""
 
     config: HomingConfig
     omap: ObjectMap
@@ -40,6 +42,7 @@ class HomingRules:
     step: Callable[[], Awaitable[None]]
     trouble: Callable[[Sequence[int]], tuple[str, str] | None]
     asked_to_stop: Callable[[], str | None]
+    forces_n: Callable[[], Array]
 
 
 def method_of(axis: AxisConfig, config: HomingConfig) -> int:
@@ -90,15 +93,23 @@ class HomingGroup:
 
     # before anything moves ---------------------------------------------------------------------------------------
     def _require_free(self) -> None:
-        limit_n = self._rules.config.free_n
         for index in self._indices:
             state = self._image.state(index)
             if state in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE):
                 raise HomingRefused(self._names[index], "It is under torque.", value=state.value, limit="disabled")
-            node = self._image.nodes[index]
-            if node.load_cell and not (abs(force_n := self._image.force_n(index)) <= limit_n):
-                cause = "Its load cell shows a component: one axis of it moved alone would strain it."
-                raise HomingRefused(node.name, cause, value=f"{force_n:.0f} N", limit=f"{limit_n:g} N")
+        if (loaded := self._loaded()) is not None:
+            cause = "Its load cell shows a component: one axis of it moved alone would strain it."
+            limit = f"{self._rules.config.free_n:g} N"
+            raise HomingRefused(loaded[0], cause, value=f"{loaded[1]:.0f} N", limit=limit)
+
+    def _loaded(self) -> tuple[str, float] | None:
+        """The first axis of the group whose load cell reads more than a free one's, or nothing, and its reading (N)."""
+        forces_n = self._rules.forces_n()
+        for index in self._indices:
+            loaded = not (abs(forces_n[index]) <= self._rules.config.free_n)
+            if self._image.nodes[index].weighed and loaded:
+                return self._names[index], float(forces_n[index])
+        return None
 
     async def _prepare(self, setup: NodeBringUp) -> None:
         rules, axis = self._rules, setup.node.axis
@@ -189,6 +200,10 @@ class HomingGroup:
         trouble = self._rules.trouble(self._indices)
         if trouble is not None:
             raise HomingFailed(*trouble)
+        if (loaded := self._loaded()) is not None:
+            limit_n = self._rules.config.free_n
+            cause = f"Its load cell reads {loaded[1]:.0f} N, more than the {limit_n:g} N of a free axis."
+            raise HomingFailed(loaded[0], cause)
 
     # the end -----------------------------------------------------------------------------------------------------
     async def _halt(self) -> None:

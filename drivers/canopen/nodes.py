@@ -12,7 +12,10 @@ from docking.errors import ConfigInvalid
 
 @dataclass(frozen=True)
 class AxisNode:
-    """One axis on the bus `channel`; `index` is its place in the cell's axis order."""
+    """One axis on the bus `channel`; `index` is its place in the cell's axis order.
+
+    `load_cell`: its drive reports the force of one. `weighed`: there is one, at the drive or on an I/O module.
+    """
 
     name: str
     index: int
@@ -20,6 +23,7 @@ class AxisNode:
     axis: AxisConfig
     load_cell: bool
     channel: str = ""
+    weighed: bool = False
 
     @property
     def driven(self) -> bool:
@@ -63,7 +67,7 @@ def axis_nodes(cell: CellFile, host_node: int) -> tuple[AxisNode, ...]:
     problems: list[str] = []
     taken = {host_node: "the controller"}
     first = can_bus_of(cell).channel
-    for positioner in as_axes_know_it(cell).positioners:
+    for positioner, fitted in zip(as_axes_know_it(cell).positioners, cell.positioners, strict=True):
         for axis in positioner.axes:
             name = f"{positioner.name}.{axis.name}"
             if axis.node is None:
@@ -73,7 +77,8 @@ def axis_nodes(cell: CellFile, host_node: int) -> tuple[AxisNode, ...]:
                 problems.append(f"axis {name}: node {axis.node} belongs to {taken[axis.node]}")
             taken[axis.node] = name
             channel = positioner.can_channel or first
-            nodes.append(AxisNode(name, len(nodes), axis.node, axis, positioner.load_cell, channel))
+            own, weighed = positioner.load_cell, fitted.load_cell
+            nodes.append(AxisNode(name, len(nodes), axis.node, axis, own, channel, weighed))
     if problems:
         raise ConfigInvalid(cell.name, tuple(problems))
     return tuple(nodes)

@@ -155,7 +155,8 @@ class CanopenPositioners:
                 self._wire, "Its axes are being enabled, moved or homed.", value="busy", limit="at rest"
             )
         setups = [setup for setup in self._setups if setup.node.name in axes and setup.node.driven]
-        rules = HomingRules(self._homing, self._map, self._bus.counts_per_mm, self._step, self._trouble, asked_to_stop)
+        watched = self._step, self._trouble, asked_to_stop, lambda: self.latest().force_n
+        rules = HomingRules(self._homing, self._map, self._bus.counts_per_mm, *watched)
         group, done = HomingGroup(self._image, setups, rules), False
         self._keeper.begin()
         self._watch.rearm()

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 
 from docking.cli import call
+from docking.errors import catalogue
 from docking.transcript import read_transcript
+from docking.words import tell
 from tests.support.dry_cell import CELLS
-from tests.support.program import Terminal, quick_cell, served
+from tests.support.program import Terminal, cell_copy, quick_cell, served
+from tests.support.weighed_cell import weighed_files
 
 pytestmark = [pytest.mark.wires, pytest.mark.timeout(120)]
 
@@ -46,6 +50,33 @@ def test_every_device_of_a_simulated_cell_answers(name, count, skew, capsys, tmp
     assert any(not line.sent for line in lines)
 
 
+def test_the_sensors_beside_the_tracker_are_asked_too(capsys):
+    assert call(["devices", str(CELLS / "lab-can-tracked.toml"), "--sim", "--json"]) == 0
+    rows = {row["where"]: row for row in told(capsys)["devices"]}
+    assert rows["camera"]["vendor"] == "NDI"
+    assert rows["inertial sensor"]["vendor"] == "VectorNav"
+    assert all(rows[name]["serial"] and rows[name]["address"] for name in ("camera", "inertial sensor"))
+
+
+def test_missing_sensors_are_named_with_what_to_do(capsys, monkeypatch, tmp_path):
+    ports = [(".toml", f"/dev/ttyUSB{n}", str(tmp_path / f"port{n}")) for n in range(3)]
+    bus = (".toml", 'interface = "socketcan"', 'interface = "docking-unix"')
+    cell = cell_copy(tmp_path, "lab-can-tracked", *ports, bus)
+    for name in ("nose", "tail"):
+        shutil.copy(CELLS / f"lab-can-tracked.{name}.rom", tmp_path)
+    for language in ("en", "zh"):
+        monkeypatch.setenv("DOCKING_LANGUAGE", language)
+        assert call(["devices", str(cell), "--json"]) == 1
+        report = told(capsys)
+        assert report["missing"] == ["tracker", "camera", "inertial sensor", "bus"]
+        remedy = catalogue(language)["1001"]["remedy"]
+        assert {(row["problem"]["code"], row["problem"]["remedy"]) for row in report["devices"]} == {(1001, remedy)}
+        assert call(["devices", str(cell)]) == 1
+        text = capsys.readouterr().out
+        assert text.count(f"-> {remedy}") == 4
+        assert tell(language, "not_in_order", names="tracker, camera, inertial sensor, bus") in text
+
+
 def test_served_devices_are_proved_and_monitored(capsys, tmp_path):
     cell = CELLS / "lab-can.toml"
     with served(cell, tmp_path) as wires:
@@ -73,6 +104,18 @@ def test_a_cell_without_its_devices_is_told_by_name_with_exit_1(capsys, tmp_path
     assert {row["problem"]["code"] for row in report["devices"]} == {1001}
     assert call(["monitor", str(cell), "--seconds", "0.2"]) == 1
     assert "1001" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["lab-can", "lab-modbus"])
+def test_load_cells_on_modules_are_monitored(name, capsys, tmp_path):
+    """A commissioning engineer puts a known weight on a ball: 60 kg are on four of them."""
+    assert call(["monitor", str(weighed_files(tmp_path, name)), "--sim", "--seconds", "0.2", "--json"]) == 0
+    forces = {row["axis"]: row["force_n"] for row in told(capsys)["axes"]}
+    assert all(force is not None for force in forces.values())
+    weights = [force for axis, force in forces.items() if axis.endswith("Z")]
+    assert min(weights) > 80.0
+    assert sum(weights) == pytest.approx(60.0 * 9.80665, abs=15.0)
+    assert max(abs(force) for axis, force in forces.items() if not axis.endswith("Z")) < 20.0
 
 
 @pytest.mark.full

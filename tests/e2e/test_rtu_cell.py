@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from docking.assemble.commissioning import devices_text, find_devices
+from docking.assemble.commissioning import Proving, devices_text, find_devices
 from docking.assemble.looking import LookRequest
 from docking.assemble.requests import RunRequest, WireChoice
 from docking.assemble.runs import dry_run
@@ -83,7 +83,7 @@ def test_a_line_that_is_too_slow_for_its_cell_is_refused(tmp_path: Path) -> None
 def test_devices_answer_on_a_terminal_and_every_byte_is_kept(tmp_path: Path) -> None:
     transcript = tmp_path / "line.txt"
     request = LookRequest(rtu_files(tmp_path), WireChoice(sim=True, wires=None), transcript=transcript)
-    report = find_devices(request, prove=True)
+    report = find_devices(request, Proving(settings=True))
     assert report["ok"], devices_text(report)
     plcs = [row for row in report["devices"] if row["where"].startswith("positioner")]
     assert [row["address"] for row in plcs] == [f"/dev/ttyUSB1 unit {unit}" for unit in (1, 2, 3, 4)]

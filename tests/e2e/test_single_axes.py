@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 
 import pytest
 
 from docking.cli import call
 from docking.config.load import load_cell
 from docking.errors import ConfigInvalid
+from docking.words import tell
 from tests.support.dry_cell import CELLS
+from tests.support.program import Terminal
 
 pytestmark = [pytest.mark.wires, pytest.mark.timeout(60)]
 
@@ -95,3 +98,13 @@ def test_a_positioner_is_never_of_this_kind(cell):
     cell.write_text(text, "utf-8")
     with pytest.raises(ConfigInvalid):
         load_cell(cell)
+
+
+@pytest.mark.parametrize("language", ["en", pytest.param("zh", marks=pytest.mark.full)])
+def test_who_interrupts_is_told_that_the_axis_goes_on(cell, language):
+    with Terminal("single", str(cell), "gate", "900", "--speed", "20", "--sim", language=language) as terminal:
+        terminal.see("0.00 mm")
+        terminal.interrupt(signal.SIGINT)
+        assert terminal.ended() == 4
+    assert tell(language, "single_goes_on", name="gate", target_mm=900.0) in terminal.text
+    assert "6003" in terminal.text

@@ -310,6 +310,26 @@ def test_axes_that_carry_something_are_refused_before_anything_is_written() -> N
     run(story)
 
 
+@pytest.mark.parametrize("reading_n", [300.0, -300.0, float("nan")])
+def test_a_load_cell_that_shows_something_on_the_way_halts_the_group(reading_n: float) -> None:
+    """Somebody set a part down, or the axis ran against something."""
+
+    async def story(bench: Bench) -> None:
+        loop = asyncio.get_running_loop()
+        bench.drives.drives.homing.switch_mm[:6] = 60.0
+        reading = np.where(np.arange(12) == 4, reading_n, 0.0)
+        loop.call_later(1.0, setattr, bench.plant, "force_n", lambda: reading)
+        began_s = loop.time()
+        error = await failure_of(bench)
+        assert error.where == "B.Y"
+        assert "load cell" in error.text()
+        assert loop.time() - began_s < 2.0
+        assert bench.master.unhomed == set(bench.master.axes)
+        await rests(bench)
+
+    run(story)
+
+
 def test_enabled_axes_are_refused() -> None:
     async def story(bench: Bench) -> None:
         await bench.master.enable()
