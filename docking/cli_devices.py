@@ -56,8 +56,8 @@ def devices(
 ) -> int:
     """Say who answers on the wires of a CELL: identity, firmware, state, units, watchdogs, round trip, start skew.
 
-    Nothing is enabled or moved; without --prove and --prove-watchdogs positioners are only read. Exits with 0 when every
-    device answers as it should, else with 1 and its name.
+    Nothing is enabled or moved; without --prove and --prove-watchdogs positioners are only read. Exits with 0 when
+    every device answers as it should, else with 1 and its name.
 
     \b
     Example: docking devices sim/cells/lab-can.toml --sim
