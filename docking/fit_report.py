@@ -113,10 +113,9 @@ def locks_p(result: FitResult) -> float | None:
 
 def centroid_cov(fit: Fit, centroid_M_mm: Array) -> Array:
     """Covariance (6, 6) of [rotation vector in rad about the axes of M, translation in mm of a point (3,) in M]."""
-    arm = centroid_M_mm - fit.pivot_mm
-    jac = np.eye(6, 7)
-    jac[3:, :3], jac[3:, 6] = -skew(arm), arm
-    result: Array = jac @ fit.whole_cov() @ jac.T
+    jac = np.eye(6)
+    jac[3:, :3] = -skew(centroid_M_mm - fit.pivot_mm)
+    result: Array = jac @ fit.cov @ jac.T
     return result
 
 

@@ -81,6 +81,22 @@ def test_covariance_and_sigma_are_what_happens(fitted: Fitted) -> None:
     assert np.mean(np.square(ratios), axis=0) == pytest.approx(np.ones(6), abs=4.0 * np.sqrt(2.0 / len(ratios)))
 
 
+def test_the_covariance_is_about_the_centroid_of_the_used_points(fitted: Fitted) -> None:
+    """By the normal matrix written out, with weights that draw the pivot of the fit metres away from the centroid."""
+    p, w = seen(), np.where(J[:, 0] > 0.0, 400.0, 1.0)
+    weights = ",".join(f"{n}={v}" for n, v in zip(NAMES, w, strict=True))
+    told = fitted(p, "--noise", "iso:0.05", "--weights", weights)[1]
+    assert told["used"] == NAMES
+    normal, turned = np.zeros((6, 6)), p - p.mean(axis=0)
+    for (x, y, z), weight in zip(turned, w, strict=True):
+        a = np.array([[0.0, z, -y, 1.0, 0.0, 0.0], [-z, 0.0, x, 0.0, 1.0, 0.0], [y, -x, 0.0, 0.0, 0.0, 1.0]])
+        normal += weight / 0.05**2 * a.T @ a
+    expected = np.linalg.inv(normal)
+    size = np.sqrt(np.diag(expected))
+    assert np.max(np.abs(expected[:3, 3:] / np.outer(size[:3], size[3:]))) > 0.5
+    assert np.allclose(np.array(told["covariance"]) / np.outer(size, size), expected / np.outer(size, size), atol=1e-3)
+
+
 def test_sigma_columns_win_over_the_noise(fitted: Fitted) -> None:
     plain, stated = (fitted(seen(), "--noise", "iso:0.04", sigma=s)[1] for s in ("", ",0.08,0.08,0.08"))
     assert plain["used"] == stated["used"] == NAMES
