@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from docking.errors import BadRecording, FileUnreadable
 from docking.point_file import read_points
+from docking.recording_checks import Raw, check_recording
 from docking.stereo_files import PixelRow, read_stereo_camera, stereo_frames
 from docking.tracking.recording import Recording
 from docking.tracking.stereo import StereoCamera
@@ -33,7 +34,6 @@ BROAD_FRAME_HZ = 50.0
 """Poses of BROAD stand at every inertial sample; so many a second are given to the filters, as a camera would."""
 _MOST_BYTES = 512 * 1024 * 1024
 _NEAR_S = 0.05
-_FORCE_M_S2, _MOST_RAD_S, _SLOWEST_S = (5.0, 20.0), 8.0, 0.2
 
 
 @dataclass
@@ -326,7 +326,7 @@ def _assembled(path: Path, parts: _Parts) -> Recording:
     if parts.cov is not None:
         cov = np.zeros((len(t), len(body.names), 3, 3))
         cov[:, [body.names.index(name) for name in names]] = parts.cov[:, here]
-    _check_units(path, parts, t, points, body)
+    check_recording(path, Raw(parts.imu, parts.encoders, t, points, body, parts.body is not None))
     imu = parts.imu if parts.imu is not None else np.zeros((0, 7))
     encoders = parts.encoders if parts.encoders is not None else np.zeros((0, 7))
     zero = float(t[0])
@@ -336,29 +336,6 @@ def _assembled(path: Path, parts: _Parts) -> Recording:
         path.stem, body, imu[:, 0] - zero, imu[:, 1:4], imu[:, 4:7], t - zero, points, sigma,
         _attitudes(path, parts.attitude, t), encoders[:, 0] - zero, turns, encoders[:, 1:4], moving, cov,
     )  # fmt: skip
-
-
-def _check_units(path: Path, parts: _Parts, frame_t: Array, points: Array, body: BodyModel) -> None:
-    """Units other than the headers say are far off what gravity, a sensor's pace and the body's size permit."""
-    if parts.imu is not None:
-        t, force = parts.imu[:, 0], float(np.median(np.linalg.norm(parts.imu[:, 1:4], axis=1)))
-        if not (_FORCE_M_S2[0] < force < _FORCE_M_S2[1]):
-            _bad(path, f"{force:.4g}", "specific force is in m/s^2 with gravity: about 9.8 in the middle")
-        rate = float(np.median(np.linalg.norm(parts.imu[:, 4:7], axis=1)))
-        if not (rate < _MOST_RAD_S):
-            _bad(path, f"{rate:.4g}", "turning rates are in rad/s: so much in the middle is no body's")
-        pace = float(np.median(np.abs(np.diff(t)))) if len(t) > 1 else np.inf
-        if not (pace < _SLOWEST_S):
-            _bad(path, f"{pace:.4g} s", "inertial samples stand so far apart: times are in s")
-        if not (t.min() < frame_t[-1] and t.max() > frame_t[0]):
-            _bad(path, f"{t[0]:.6g} s, {frame_t[0]:.6g} s", "inertial samples and frames are on one clock")
-    if parts.body is not None and len(body.names) > 2:
-        whole = points[np.isfinite(points).all(axis=(1, 2))][:100]
-        if len(whole):
-            nominal = float(np.ptp(body.points_B_mm, axis=0).max())
-            seen = float(np.median(np.linalg.norm(np.ptp(whole, axis=1), axis=1)))
-            if not (0.02 * nominal < seen < 50.0 * nominal):
-                _bad(path, f"{seen:.4g} mm", f"the seen points span so much, the nominal ones {nominal:.4g} mm")
 
 
 def _in_body_order(

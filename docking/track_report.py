@@ -75,7 +75,8 @@ def track_text(result: Followed) -> str:
     lines = [f"{result.recording.name}: method {result.method}, {answer['frames']} frames followed"]
     if result.choice is not None:
         lines.append(f"auto chose {result.choice.method}: {result.choice.why}")
-    lines.append(f"inertial stamps late by {1000.0 * result.time_offset_s:.2f} ms")
+    if len(result.recording.imu_t_s):
+        lines.append(f"inertial stamps late by {1000.0 * result.time_offset_s:.2f} ms")
     for gap in result.gaps:
         kind = "moving" if gap.moving else "at rest"
         lines.append(

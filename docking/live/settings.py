@@ -51,7 +51,7 @@ def tracker_at_rest(settings: LiveSettings, X_WB: Pose) -> Tracker:
     """A fresh tracker for a part that stands at about `X_WB`."""
     body, model = settings.body, settings.model
     if settings.chosen == "encoders":
-        return EncoderTracker(body, EncoderSettings(offset_sd_mm=2.0 * settings.match_mm))
+        return EncoderTracker(body, EncoderSettings(offset_sd_mm=2.0 * settings.match_mm, watch=None))
     start = Start(X_WB.R, START_TILT_RAD, START_TILT_RAD, AT_REST_MM_S)
     if settings.chosen == "repaired":
         return RepairedTracker(body, model, start)

@@ -13,15 +13,18 @@ walk slowly: settling, temperature, compliance under changing load.
 from __future__ import annotations
 
 from bisect import bisect_right
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from docking.errors import BadArgument, DockingError
 from docking.geometry import skew
+from docking.tracking.axis_filters import Mask
 from docking.tracking.body import body_pose, described
-from docking.tracking.faults import Alarms
+from docking.tracking.encoder_watch import EncoderWatch
+from docking.tracking.faults import Alarms, WatchSettings
 from docking.tracking.pointwise import FOR_A_POSE
 from docking.tracking.types import BodyModel, TrackedState
 from docking.types import Array, Pose
@@ -34,7 +37,9 @@ _STATES = 18
 class EncoderSettings:
     """Noise of a read-back (mm) and the time over which a line is laid through them; sd of offset and scale at the
     start, and their walks a sqrt(s). `unlike`: by what share of `scale_sd` the scales of the positioners differ from
-    each other, which turns the body on its way: pitch errors and temperature of like drives are mostly common."""
+    each other, which turns the body on its way: pitch errors and temperature of like drives are mostly common.
+    `blind_mm_s`: how fast the body may be while no read-back tells. `watch` None: who pushes frames in has judged them.
+    """
 
     noise_mm: float = 0.02
     offset_sd_mm: float = 10.0
@@ -44,6 +49,8 @@ class EncoderSettings:
     scale_walk: float = 1e-6
     history_s: float = 2.0
     smooth_s: float = 0.1
+    blind_mm_s: float = 20.0
+    watch: WatchSettings | None = field(default_factory=WatchSettings)
 
 
 class _Here(NamedTuple):
@@ -67,7 +74,7 @@ class EncoderTracker:
         size_mm = max(float(np.sqrt(np.mean(np.sum(off * off, axis=1)))), 1.0)
         sd = np.repeat([s.offset_sd_mm, s.offset_sd_mm / size_mm, s.scale_sd], 3)
         differing = s.unlike / size_mm
-        self._p = np.diag(np.concatenate([sd, np.full(9, differing * s.scale_sd)]) ** 2)
+        self._p = self._begun = np.diag(np.concatenate([sd, np.full(9, differing * s.scale_sd)]) ** 2)
         walk = np.repeat([s.offset_walk_mm, s.offset_walk_mm / size_mm, s.scale_walk], 3)
         self._walk = np.concatenate([walk, np.full(9, differing * s.scale_walk)]) ** 2
         self._x = np.zeros(_STATES)
@@ -79,6 +86,7 @@ class EncoderTracker:
         self._used_s = float("nan")
         self._seen = np.zeros(len(body.names), dtype=bool)
         self._alarms = Alarms()
+        self._watch = EncoderWatch(body, s.watch, self._alarms) if s.watch is not None else None
         self.dropped = 0
 
     def imu(self, t_s: float, force_m_s2: Array, rate_rad_s: Array) -> None:
@@ -86,12 +94,15 @@ class EncoderTracker:
 
     def encoders(self, t_s: float, X_WB: Pose) -> None:
         """One read-back; see `Tracker.encoders`."""
+        place = X_WB.apply(self.body.points_B_mm)
+        if self._watch is not None:
+            self._watch.read_back(t_s, place)
         if self._times and not (t_s > self._times[-1]):
             self.dropped += 1
             return
         self._times.append(t_s)
         self._poses.append(X_WB)
-        self._places.append(X_WB.apply(self.body.points_B_mm))
+        self._places.append(place)
         if len(self._times) > 512 and self._times[256] < t_s - self._s.history_s:
             del self._times[:256], self._poses[:256], self._places[:256]
 
@@ -110,7 +121,9 @@ class EncoderTracker:
         elif n == 2:
             weights = np.array([0.0, 1.0])
         points = np.tensordot(weights, np.array(self._places[first:last]), 1)
-        return _Here(points, self._poses[last - 1].R, float(weights @ weights) * self._s.noise_mm**2)
+        late_s = max(t_s - self._times[-1] - self._s.smooth_s, 0.0)
+        common = float(weights @ weights) * self._s.noise_mm**2 + (self._s.blind_mm_s * late_s) ** 2
+        return _Here(points, self._poses[last - 1].R, common)
 
     def _slopes(self, points: Array, about: Array) -> Array:
         """d(points) / d(states), (k, 3, 18), for points of the body whose middle is at `about`."""
@@ -130,25 +143,62 @@ class EncoderTracker:
             self.dropped += 1
             return
         about = here.points.mean(axis=0)
+        if self._watch is not None:
+            self._watch.silent(t_s)
         if self._origin is None:
             self._origin = about
         if not np.isnan(self._frame_s):
-            self._p = self._p + np.diag(self._walk * (t_s - self._frame_s))
+            self._p = self._ahead(t_s)
         self._frame_s = t_s
+        good = self._believed(t_s, rows, (xyz_W_mm, cov_mm2), here)
+        rows, xyz_W_mm, cov_mm2 = rows[good], xyz_W_mm[good], cov_mm2[good]
         self._seen = np.zeros(len(self.body.names), dtype=bool)
         self._seen[rows] = True
-        if rows:
+        if len(rows):
             H = self._slopes(here.points[rows], about).reshape(-1, _STATES)
             # what all points share weighs as many times as there are points
             var = np.diagonal(cov_mm2, axis1=1, axis2=2).ravel() + len(rows) * here.common_mm2
             self._update(H, (xyz_W_mm - here.points[rows]).ravel(), var)
             self._used_s = t_s
 
-    def _rows(self, names: tuple[str, ...]) -> list[int]:
+    def _rows(self, names: tuple[str, ...]) -> NDArray[np.intp]:
         for name in names:
             if name not in self._index:
                 raise BadArgument(self.body.name, "no such point", value=name)
-        return [self._index[name] for name in names]
+        return np.array([self._index[name] for name in names], dtype=np.intp)
+
+    def _believed(self, t_s: float, rows: NDArray[np.intp], seen: tuple[Array, Array], here: _Here) -> Mask:
+        """Which points (k, 3) with covariances (k, 3, 3) are taken in; begins anew where none has been for long."""
+        xyz, noise = seen
+        about = here.points.mean(axis=0)
+        if self._watch is None or len(rows) == 0:
+            return np.ones(len(rows), dtype=bool)
+        if self._watch.repeated(xyz, about):
+            return np.zeros(len(rows), dtype=bool)
+        beyond = xyz - here.points[rows]
+        sd_mm = float(np.sqrt(np.trace(noise, axis1=1, axis2=2).max()))
+        self._watch.compare(beyond, sd_mm)
+        H = self._slopes(here.points[rows], about)
+        cov = H @ self._p @ H.transpose(0, 2, 1) + noise + here.common_mm2 * np.eye(3)
+        residual = beyond - H @ self._x
+        good = self._watch.agreeing(rows, xyz, residual, cov)
+        if not good.any() and self._watch.refused(t_s, residual, sd_mm):
+            # Nothing is believed any more of where the part sits; this frame says it anew.
+            shift = beyond.mean(axis=0)
+            self._x, self._p = np.zeros(_STATES), self._begun.copy()
+            self._x[_OFFSET] = shift
+            self._origin = about
+            return np.ones(len(rows), dtype=bool)
+        return good
+
+    def _ahead(self, t_s: float) -> Array:
+        """Covariance of the states at `t_s`; where the read-backs do not tell, the body may have gone anywhere."""
+        p = self._p + np.diag(self._walk * max(t_s - self._frame_s, 0.0))
+        if self._watch is not None and self._watch.frozen:
+            used_s = self._frame_s if np.isnan(self._used_s) else self._used_s
+            before_s, now_s = self._frame_s - used_s, max(t_s, self._frame_s) - used_s
+            p[_OFFSET, _OFFSET] += self._s.blind_mm_s**2 * (now_s**2 - before_s**2) * np.eye(3)
+        return p
 
     def _update(self, H: Array, shown_mm: Array, var: Array) -> None:
         """Kalman update by the information of the whole frame: P = (P^-1 + H^T R^-1 H)^-1."""
@@ -170,7 +220,7 @@ class EncoderTracker:
         assert here is not None
         about = here.points.mean(axis=0)
         H = self._slopes(here.points, about)
-        ahead = self._p + np.diag(self._walk * max(t - self._frame_s, 0.0))
+        ahead = self._ahead(t)
         common = here.common_mm2 * np.eye(3)
         cov = H @ ahead @ H.transpose(0, 2, 1) + common
         points = here.points + H @ self._x

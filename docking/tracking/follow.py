@@ -91,9 +91,8 @@ def follow(recording: Recording, gaps: Sequence[Gap], settings: FollowSettings) 
     tracker = make_tracker(used, method, settings)
     path = play(used, tracker, hide, alarms.append)
     if isinstance(tracker, InertialTracker):
-        navigation = tracker.navigation()
         # With stamps put right, what the filter still finds is the sensor's own: its forces lag less than its rates.
-        late = late or (navigation.late_s if navigation else 0.0)
+        late = late or tracker.late_s()
         if method == "ins-smoothed":
             path = smoothed_path(used, tracker, path)
     return Followed(used, method, path, judged(used, path, gaps, hide), choice, late, alarms)

@@ -19,7 +19,7 @@ from docking.tracking.body import body_pose
 from docking.tracking.faults import Alarms, FrameWatch, InertialWatch, swapped
 from docking.tracking.inertial_body import body_state, on_time
 from docking.tracking.inertial_core import BA, BG, PHI, P, V
-from docking.tracking.inertial_events import Event, Frame, Head, InertialSettings, Sample, Still, between, whole
+from docking.tracking.inertial_events import Event, Frame, Head, InertialSettings, Sample, Still, between, whole, within
 from docking.tracking.smoothing import Tape
 from docking.tracking.types import MM_PER_M, BodyModel, InertialModel, Start, TrackedState
 from docking.tracking.zero_velocity import RestDetector
@@ -173,7 +173,7 @@ class InertialTracker:
         if mark < 0:
             self.dropped += 1
             return
-        between = self._interpolated(place, t_s) if isinstance(event, Frame) else None
+        between = within(self._times, self._events, place, t_s) if isinstance(event, Frame) else None
         for late in (event,) if between is None else (event, between):
             self._times.insert(place, t_s)
             self._events.insert(place, late)
@@ -181,17 +181,6 @@ class InertialTracker:
         del self._marks[mark + 1 :]
         for k in range(bisect_right(self._times, self._marks[mark].nav.t_s), len(self._times)):
             self._do(self._times[k], self._events[k])
-
-    def _interpolated(self, place: int, t_s: float) -> Sample | None:
-        """The sample at `t_s`, between the kept ones on both sides of `place`."""
-        before = next((i for i in range(place - 1, -1, -1) if isinstance(self._events[i], Sample)), None)
-        after = next((i for i in range(place, len(self._events)) if isinstance(self._events[i], Sample)), None)
-        if before is None or after is None:
-            return None
-        a, b = self._events[before], self._events[after]
-        assert isinstance(a, Sample)
-        assert isinstance(b, Sample)
-        return between(a, b, (t_s - self._times[before]) / (self._times[after] - self._times[before]))
 
     def _go_back(self, mark: Head) -> None:
         self._head = mark
@@ -215,7 +204,7 @@ class InertialTracker:
                 self._mark()
             return
         if t_s > head.nav.t_s:
-            self._head = self._advanced(head, t_s, head.sample)
+            self._head = self._advanced(head, t_s, self._held(head, t_s))
         self._mark()
         if isinstance(event, Frame):
             self._take_frame(event)
@@ -223,6 +212,10 @@ class InertialTracker:
             self._take_rest(event)
         assert self._head is not None
         self._marks[-1] = self._head
+
+    def _held(self, head: Head, t_s: float) -> Sample | None:
+        """The sample that goes for what follows it; None where the sensor has been silent for too long."""
+        return None if self._samples_watch.silent(t_s) else head.sample
 
     def _advanced(self, head: Head, t_s: float, sample: Sample | None) -> Head:
         """The head at `t_s`: trapezoid between its last sample and `sample`, nothing believed of a bad one."""
@@ -309,7 +302,7 @@ class InertialTracker:
         head = self._head
         assert head is not None
         sd = float(np.sqrt(np.trace(frame.cov_mm2, axis1=1, axis2=2).max()))
-        if self._frames_watch.refused(head.nav.t_s, residual, np.zeros(len(frame.rows), dtype=bool), sd):
+        if self._frames_watch.refused(head.nav.t_s, residual, sd):
             self._restart(head, residual.mean(axis=0))
 
     def _restart(self, head: Head, shift_mm: Array) -> None:
@@ -379,6 +372,10 @@ class InertialTracker:
         """The nominal state of the sensor, with its biases and the extra states."""
         return self._head.nav if self._head else None
 
+    def late_s(self) -> float:
+        """By how much the stamps were found to be late beyond what was corrected; 0 where nothing shows it."""
+        return core.known_lag_s(self._head.nav, self._head.cov, self._layout) if self._head else 0.0
+
     def state(self, t_s: float | None = None) -> TrackedState | None:
         """See `Tracker.state`."""
         head = self._head
@@ -388,7 +385,7 @@ class InertialTracker:
         if t_s is not None:
             back = next((mark for mark in reversed(self._marks) if mark.nav.t_s <= t_s), self._marks[0])
             head = back if t_s < head.nav.t_s else head
-            head = self._advanced(head, t_s, head.sample)
+            head = self._advanced(head, t_s, self._held(head, t_s))
         head = self._carried(head)
         self._tape = tape
         rate = head.sample.rate if head.sample else head.nav.rate_bias

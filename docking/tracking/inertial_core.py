@@ -24,6 +24,8 @@ from docking.types import Array
 P, V, PHI, BA, BG = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
 BASE = 15
 _EYE3 = np.eye(3)
+_LAG_KNOWN_S = 1e-3
+"""A lag with a larger sd is none that was found."""
 
 
 class Extras(NamedTuple):
@@ -117,6 +119,12 @@ def integrate(nav: Navigation, since: Since, t_s: float, force: Array, rate: Arr
     )
     ds = summed_ds + (summed_dv + 0.5 * dv) * dt
     return moved, Since(summed_s + dt, summed_dv + dv, ds, summed_angle + angle, summed_push + push)
+
+
+def known_lag_s(nav: Navigation, cov: Array, layout: Layout) -> float:
+    """By how much the sensor's stamps are late, 0 where the data do not show it."""
+    at = layout.time
+    return nav.late_s if at is not None and float(cov[at, at][0, 0]) <= _LAG_KNOWN_S**2 else 0.0
 
 
 def squared(nav: Navigation) -> Navigation:

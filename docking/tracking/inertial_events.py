@@ -75,6 +75,18 @@ def between(a: Sample, b: Sample, share: float) -> Sample:
     return Sample(a.force + share * (b.force - a.force), a.rate + share * (b.rate - a.rate), a.good and b.good)
 
 
+def within(times: list[float], events: list[Event], place: int, t_s: float) -> Sample | None:
+    """The sample at `t_s`, between those on both sides of `place`; None where one is missing."""
+    before = next((i for i in range(place - 1, -1, -1) if isinstance(events[i], Sample)), None)
+    after = next((i for i in range(place, len(events)) if isinstance(events[i], Sample)), None)
+    if before is None or after is None:
+        return None
+    a, b = events[before], events[after]
+    assert isinstance(a, Sample)
+    assert isinstance(b, Sample)
+    return between(a, b, (t_s - times[before]) / (times[after] - times[before]))
+
+
 def whole(body: BodyModel, frame: Frame) -> tuple[Array, Array]:
     """A frame's points in the rows of the body; the others are not meant to be used."""
     points, cov = np.zeros((len(body.names), 3)), np.tile(np.eye(3), (len(body.names), 1, 1))

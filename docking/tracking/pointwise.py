@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from docking.errors import AttitudeUnknown, BadArgument, DockingError, TooFewPoints
 from docking.geometry import log_so3
 from docking.tracking.axis_filters import Mask
-from docking.tracking.body import BodyPose, body_pose, described
-from docking.tracking.faults import Alarms, InertialWatch, WatchSettings
+from docking.tracking.body import BodyPose, body_pose, described, points_from_pose
+from docking.tracking.faults import Alarms, FrameWatch, InertialWatch, StepWatch, WatchSettings, swapped
 from docking.tracking.strapdown import G_W_MM_S2, Integral, Strapdown
 from docking.tracking.types import BodyModel, InertialModel, Start, TrackedState
 from docking.tracking.zero_velocity import RestDetector, ZeroVelocity
@@ -26,6 +26,10 @@ SHOWN_HEADING_RAD, SHOWN_TILT_RAD = 0.003, 0.0003
 study of tracking shows for eight points of 1 mm."""
 REST_WINDOW_S = 0.25
 """Over which the rate at rest is averaged."""
+SWAP_GATE = 30.0
+"""Squared distance in sigmas within which a point that was taken for another lies at that one's place."""
+UNFELT_MM_S2 = 5000.0
+"""What the body may do unnoticed, 1 sigma with a tenth of a second of memory."""
 LEVEL_S, REST_LEVEL_GAIN = 300.0, 0.2
 """Where too few points show the attitude: time in which the mean specific force levels it, and the share of the tilt
 that one window of rest takes away."""
@@ -54,9 +58,11 @@ class PointwiseTracker:
         self._index = {name: i for i, name in enumerate(body.names)}
         self._alarms = Alarms()
         self._watch = InertialWatch(model, WatchSettings(), self._alarms, f"{body.name} inertial sensor")
+        self._frames_watch = FrameWatch(body, WatchSettings(), self._alarms)
+        self._step_watch = StepWatch(body, self._alarms)
         self._strapdown: Strapdown | None = None
         self._levelled: Integral | None = None
-        self._rest, self._quiet_s = RestDetector(ZeroVelocity(), model), float("inf")
+        self._rest, self._quiet_s, self._resting = RestDetector(ZeroVelocity(), model), float("inf"), False
         self._waiting: list[Frame] = []
         self._frame_s = float("nan")
         self._used_s = float("nan")
@@ -92,6 +98,7 @@ class PointwiseTracker:
         while self._waiting and self._waiting[0].t_s <= t_s:
             self._take(self._waiting.pop(0))
         quiet = self._rest.sample(t_s, force_m_s2, rate_rad_s)
+        self._resting = self._resting if quiet is None else quiet
         if quiet is False or self._quiet_s > t_s:
             self._quiet_s = t_s
         if quiet and t_s - self._quiet_s >= SURE_REST_S:
@@ -119,6 +126,7 @@ class PointwiseTracker:
         """A frame at its turn: the samples have passed it, or are not waited for."""
         assert self._strapdown is not None
         t_s, ins = frame.t_s, self._strapdown.at(frame.t_s)
+        self._watch.silent(t_s)
         if ins is None or (t_s <= self._frame_s):
             self.dropped += 1
             return
@@ -127,12 +135,40 @@ class PointwiseTracker:
                 return
             self._begin(frame, ins)
         else:
+            frame = self._believed(frame, ins)
             self._step(frame, ins)
         self._lost = [ins if seen else old for seen, old in zip(frame.seen.tolist(), self._lost, strict=True)]
         self._frame_s, self._seen = t_s, frame.seen
         if frame.seen.any():
             self._used_s = t_s
         self._level(frame)
+
+    def _believed(self, frame: Frame, ins: Integral) -> Frame:
+        """The frame without what is not believed: all of one that a camera repeats, points seen in each other's place.
+        A step of all points is told, but taken: the equations have no gate."""
+        if self._frames_watch.frozen(frame.xyz_mm[frame.seen], self._resting):
+            frame = replace(frame, seen=np.zeros_like(frame.seen))
+        if len(frame.seen) > 1:
+            frame = self._without_swapped(frame, ins)
+        if frame.seen.any():
+            way = np.where(frame.seen[:, None], frame.xyz_mm - ins.s_mm - self._arms_W(ins.C_WI), np.nan)
+            noise = float(np.sqrt(frame.var_mm2[frame.seen].sum(axis=1).mean()))
+            self._step_watch.frame(frame.t_s, way, noise)
+        return frame
+
+    def _without_swapped(self, frame: Frame, ins: Integral) -> Frame:
+        expected, cov, _ = self._points_at(frame.t_s, ins)
+        if int(self._seen.sum()) >= FOR_A_POSE:  # one that is left out for long is where the others have the body
+            pose = body_pose(self.body, expected, cov, rows=np.flatnonzero(self._seen))
+            expected, cov = points_from_pose(self.body, pose)
+        rows = np.flatnonzero(frame.seen)
+        wide = np.trace(cov, axis1=1, axis2=2)[rows] + frame.var_mm2[rows].sum(axis=1)
+        near_mm = float(np.sqrt(SWAP_GATE * wide.max(initial=0.0) / 3.0))
+        pairs = swapped(expected[rows], frame.xyz_mm[rows], near_mm)
+        self._frames_watch.tell_swapped(tuple(self.body.names[i] for i in rows), pairs)
+        seen = frame.seen.copy()
+        seen[rows[[i for pair in pairs for i in pair]]] = False
+        return replace(frame, seen=seen)
 
     def encoders(self, t_s: float, X_WB: Pose) -> None:
         """Not used by this method."""
@@ -215,7 +251,15 @@ class PointwiseTracker:
     def _left_out(self, ins: Integral) -> Array:
         """Variances (n, 3) of what the model leaves out: only for points that are hidden."""
         hidden = [None if seen else lost for seen, lost in zip(self._seen.tolist(), self._lost, strict=True)]
-        return np.array([np.zeros(3) if lost is None else self._unmodelled_mm2(lost, ins) for lost in hidden])
+        unfelt = self._unfelt_mm2(ins.t_s)
+        return np.array([np.zeros(3) if lost is None else self._unmodelled_mm2(lost, ins) + unfelt for lost in hidden])
+
+    def _unfelt_mm2(self, t_s: float) -> float:
+        """Variance a coordinate of what the body may have done since the last sample, where the sensor is silent."""
+        assert self._strapdown is not None
+        if not self._watch.silent(t_s):
+            return 0.0
+        return UNFELT_MM_S2**2 * 0.1 * (t_s - self._strapdown.t_s) ** 3 / 3.0
 
     def _described(self, t_s: float, points: Array, cov: Array, velocity: Array, ins: Integral) -> TrackedState:
         body, R_WB, more = self.body, ins.C_WI @ self.body.X_BI.R.T, self._left_out(ins)

@@ -63,3 +63,21 @@ def test_a_gap_that_the_recording_does_not_hold_is_refused(tmp_path: Path) -> No
     assert len(gaps_of(recording, {"occlude": ("0.5:1",)})) == 1
     with pytest.raises(BadArgument):
         gaps_of(recording, {"occlude": ("1.5:1",)})
+
+
+def test_frames_without_a_point_or_in_other_units_of_time_and_read_backs_of_another_clock_are_refused(
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(BadRecording, match="no frame shows a point"):
+        read_recording(files(tmp_path, samples(), np.zeros((3, 3))))
+    paths = files(tmp_path, samples())
+    rows = paths[1].read_text().splitlines()
+    later = [f"{1e5 * float(t)},{rest}" for t, _, rest in (row.partition(",") for row in rows[1:])]
+    paths[1].write_text("\n".join([rows[0], *later]))
+    with pytest.raises(BadRecording, match="times are in s"):
+        read_recording(paths)
+    paths = files(tmp_path, samples())
+    encoders = tmp_path / "encoders.csv"
+    encoders.write_text("t_s,x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg\n700,0,0,0,0,0,0\n700.1,0,0,0,0,0,0\n")
+    with pytest.raises(BadRecording, match="one clock"):
+        read_recording([*paths, encoders])

@@ -151,3 +151,23 @@ def test_a_fault_that_stands_is_told_once_whatever_other_sources_do() -> None:
     force[stuck], rate[stuck] = force[np.argmax(stuck)], rate[np.argmax(stuck)]
     alarms, _ = run(replace(recording, force_m_s2=force, rate_rad_s=rate))
     assert [type(alarm) for alarm in alarms].count(SensorFrozen) == 1
+
+
+def test_an_inertial_sensor_that_falls_silent_is_told_once_and_bridges_nothing() -> None:
+    """Holding its last sample would carry the body away, and say that it knows where."""
+    recording, truth, _ = record(BODY, LENGTH_S)
+    here = recording.imu_t_s < 4.0
+    cut = {key: getattr(recording, key)[here] for key in ("imu_t_s", "force_m_s2", "rate_rad_s")}
+    alarms, path = run(replace(recording, **cut), hide_from_s=5.0)
+    assert kinds(alarms) == {TimeJumped}
+    assert len(alarms) == 1
+    assert honest(path, truth)
+    assert path.sd_mm[-1].max() > 100.0
+
+
+def test_a_clock_that_stutters_is_told_once() -> None:
+    recording, _, _ = record(BODY, LENGTH_S)
+    rows = np.repeat(np.arange(len(recording.imu_t_s)), np.where(recording.imu_t_s > 3.0, 2, 1))
+    twice = {key: getattr(recording, key)[rows] for key in ("imu_t_s", "force_m_s2", "rate_rad_s")}
+    alarms, _ = run(replace(recording, **twice))
+    assert [type(alarm) for alarm in alarms] == [TimeJumped]
