@@ -26,10 +26,13 @@ def random_pose(rng: np.random.Generator, reach_mm: float = 10000.0) -> Pose:
     return Pose(Rotation.random(random_state=rng).as_matrix(), rng.uniform(-reach_mm, reach_mm, 3))
 
 
-def screened(j: np.ndarray, p: np.ndarray, cov: np.ndarray | None = None) -> Screened:
+def screened(
+    j: np.ndarray, p: np.ndarray, cov: np.ndarray | None = None, nominal_cov: np.ndarray | None = None
+) -> Screened:
     n = len(j)
     s = np.broadcast_to(0.05**2 * np.eye(3), (n, 3, 3)) if cov is None else cov
-    return Screened(tuple(f"P{i}" for i in range(n)), j, np.zeros((n, 3, 3)), p, np.array(s))
+    s_j = np.zeros((n, 3, 3)) if nominal_cov is None else nominal_cov
+    return Screened(tuple(f"P{i}" for i in range(n)), j, s_j, p, np.array(s))
 
 
 def largest_gap_mm(X: Pose, Y: Pose, j: np.ndarray) -> float:
@@ -94,15 +97,16 @@ def test_moving_both_frames_moves_the_pose(seed: int, n: int, name: str) -> None
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10**6), st.integers(4, 15), st.sampled_from(METHODS), st.sampled_from([1.0, 1e-3, 1 / 25.4]))
 def test_a_whole_fit_follows_frames_and_unit_of_length(seed: int, n: int, method: str, unit: float) -> None:
-    """Pose, covariance and chi-square of any method, with covariances that turn and scale along."""
+    """Pose, covariance and chi-square of any method, with covariances of both sides that turn and scale along."""
     rng = np.random.default_rng(seed)
     j = rng.uniform(-3000.0, 3000.0, (n, 3))
-    root = rng.normal(0.0, 0.05, (n, 3, 3)) + 0.05 * np.eye(3)
-    cov = root @ root.transpose(0, 2, 1) + 1e-4 * np.eye(3)
+    root = rng.normal(0.0, 0.05, (2, n, 3, 3)) + 0.05 * np.eye(3)
+    cov, nominal_cov = root @ root.transpose(0, 1, 3, 2) + 1e-4 * np.eye(3)
     p = random_pose(rng).apply(j) + rng.normal(0.0, 0.1, j.shape)
     A, B = random_pose(rng), random_pose(rng)
-    one = fit_pose(screened(j, p, cov), FitSettings(method=method))
-    moved = screened(unit * A.apply(j), unit * B.apply(p), unit**2 * B.R @ cov @ B.R.T)
+    one = fit_pose(screened(j, p, cov, nominal_cov), FitSettings(method=method))
+    turned = unit**2 * B.R @ cov @ B.R.T, unit**2 * A.R @ nominal_cov @ A.R.T
+    moved = screened(unit * A.apply(j), unit * B.apply(p), *turned)
     two = fit_pose(moved, FitSettings(method=method))
     back = B.inverse() @ Pose(two.X_MN.R, two.X_MN.t_mm / unit) @ A
     assert largest_gap_mm(back, one.X_MN, j) <= 1e-6
