@@ -4,15 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import special
 
 from docking.errors import CheckPointDisagrees, SigmaMissing
 from docking.geometry import euler_to_matrix
 from docking.pose import Budget, Features, check_points_agree, feature_errors, goal_pose
-from docking.types import Fit, Points, Pose
+from docking.types import RISK_LIMIT, Fit, Points, Pose
 
 ZERO = np.zeros((6, 6))
 QUIET = Budget(0.0, 0.0, 0.0)
 TURN = Pose(euler_to_matrix(0.02, -0.01, 0.6), np.array([100.0, 200.0, -50.0]))
+NEAR = Pose(np.eye(3), np.array([-4000.0, 0.0, 0.0]))
 FACE = np.array([[4000.0, 2000.0, 0.0], [4000.0, -2000.0, 0.0], [4000.0, 0.0, 2000.0], [4000.0, 0.0, -2000.0]])
 
 
@@ -45,6 +47,38 @@ def test_every_part_of_sigma_counts_once() -> None:
     assert drift.sigma_mm == pytest.approx([0.05] * 4, rel=1e-6)
     nominal = feature_errors(fit(Pose.identity()), fit(Pose.identity()), features(0.03), QUIET)
     assert nominal.sigma_mm == pytest.approx([0.03 * np.sqrt(2)] * 4)
+
+
+def test_risk_knows_what_the_features_have_in_common() -> None:
+    """With nothing measured off, |error| / sigma follows chi with 3 degrees of freedom; a drift moves all features
+    alike and so counts once, the features' own sigmas each for themselves."""
+    inside = 1.0 - special.chdtrc(3, (0.2 / 0.08) ** 2)
+    drift = feature_errors(fit(NEAR), fit(Pose.identity()), features(), Budget(0.08, 0.0, 0.0))
+    assert drift.risk == pytest.approx(1.0 - inside, abs=0.01)
+    own = feature_errors(fit(NEAR), fit(Pose.identity()), features(0.08 / np.sqrt(2)), QUIET)
+    assert own.risk == pytest.approx(1.0 - inside**4, abs=0.015)
+
+
+def test_a_feature_is_accepted_by_error_and_sigma_and_by_the_risk_of_all() -> None:
+    """Along one direction e + 2 sigma = 0.98 of the tolerance is accepted and 1.01 is not; with e = 0 and the same sigma
+    in all directions it is the risk that refuses."""
+    cov = np.diag([0, 0, 0, 0.05**2, 1e-12, 1e-12])
+    for error_mm, accepted in ((0.096, True), (0.102, False)):
+        shifted = Pose(np.eye(3), NEAR.t_mm + [error_mm, 0.0, 0.0])
+        found = feature_errors(fit(shifted, cov), fit(Pose.identity()), features(), QUIET)
+        assert (found.accepted(), found.risk < RISK_LIMIT) == (accepted, True)
+    found = feature_errors(fit(NEAR), fit(Pose.identity()), features(0.07 / np.sqrt(2)), QUIET)
+    assert np.all(found.norm_mm + 2.0 * found.sigma_mm < 0.2)
+    assert not found.accepted()
+
+
+def test_a_fit_with_larger_residuals_than_stated_is_believed_less() -> None:
+    cov = np.diag([0, 0, 0, 0.03**2, 0.01**2, 0.01**2])
+    for chi2, factor in ((36.0, np.sqrt(3.0)), (12.0, 1.0), (3.0, 1.0)):
+        loud = replace(fit(NEAR, cov), chi2=chi2, dof=12)
+        for pair in ((loud, fit(Pose.identity())), (fit(NEAR), replace(loud, X_MN=Pose.identity()))):
+            found = feature_errors(*pair, features(), QUIET)
+            assert found.sigma_mm == pytest.approx([0.03 * factor] * 4, rel=1e-6)
 
 
 def test_rotation_acts_through_the_arm() -> None:
