@@ -60,7 +60,7 @@ def test_risk_knows_what_the_features_have_in_common() -> None:
 
 
 def test_a_feature_is_accepted_by_error_and_sigma_and_by_the_risk_of_all() -> None:
-    """Along one direction e + 2 sigma of 0.98 of the tolerance is accepted and 1.01 is not; where e = 0 and all directions
+    """Along one direction 0.98 of the tolerance as e + 2 sigma is accepted and 1.01 not; where e = 0 and all directions
     are as uncertain it is the risk that refuses."""
     cov = np.diag([0, 0, 0, 0.05**2, 1e-12, 1e-12])
     for error_mm, accepted in ((0.096, True), (0.102, False)):
