@@ -65,7 +65,8 @@ def find_devices(request: LookRequest, proving: Proving = LOOKING) -> dict[str, 
     async def main() -> dict[str, Any]:
         async with wires_of(request, cell) as ends:
             rows = [await _tracker(cell, ends)]
-            rows += [await _sensor(*sensor) for sensor in sensors_of(cell, request.cell_path.parent, ends.found)]
+            sensors = sensors_of(cell, request.cell_path.parent, ends.found, ends.transcript)
+            rows += [await _sensor(*sensor) for sensor in sensors]
             skew = None
             if ends.bus.can is not None:
                 rows += await _bus(cell, ends.bus.can)
@@ -258,7 +259,7 @@ def devices_text(report: dict[str, Any], language: str = "en") -> str:
         what, remedy = refused["message"], refused["remedy"]
         lines.append(tell(language, "bring_up_refused", code=refused["code"], error=what, remedy=remedy))
     lines += [f"warning: {text}" for text in report["warnings"]]
-    amiss = [*report["missing"], *([report["bring_up"]["where"]] if report["bring_up"] else [])]
-    verdict = tell(language, "all_answer") if report["ok"] else tell(language, "not_in_order", names=", ".join(amiss))
-    lines.append(verdict)
+    refused_by = [report["bring_up"]["where"]] if report["bring_up"] else []
+    names = ", ".join(dict.fromkeys((*report["missing"], *refused_by)))
+    lines.append(tell(language, "all_answer") if report["ok"] else tell(language, "not_in_order", names=names))
     return "\n".join(lines)

@@ -105,7 +105,9 @@ def run_on_wires(request: RunRequest, choice: WireChoice, say: Say, *, step: boo
             if transcript is not None:
                 serial = TranscribedSerial(serial, transcript, "tracker")
                 found = {**found, "transcript": str(transcript.path.resolve())}
-            streams = streams_of(files.cell, request.cell_path.parent, found) if files.cell.live is not None else None
+            streams = None
+            if files.cell.live is not None:
+                streams = streams_of(files.cell, request.cell_path.parent, found, transcript)
             wires, joined = Wires(serial=serial, streams=streams), _Joined(process, found)
             try:
                 return await _dock(_Run(files, request, wires, operator, path, far, choice.sim, joined, step))

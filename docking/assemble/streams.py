@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from docking.assemble.simulated import FarEnd
+from docking.assemble.transcribed import TranscribedDevice, TranscribedSpeed
 from docking.config import CellFile, JobFile
 from docking.config.base import PoseVector
 from docking.config.instruments import InertialConfig, NdiConfig
@@ -15,6 +16,7 @@ from docking.errors import BadArgument, FileUnreadable
 from docking.live import LiveStreams
 from docking.ports import InertialSensor, PointStream, SerialLink, SpeedLink
 from docking.stereo_files import stereo_camera
+from docking.transcript import TranscribedSerial, Transcript
 from drivers.links.serial_port import SerialPort
 from drivers.ndi_line import DEFAULT_BAUD
 from drivers.ndi_stream import NdiStream
@@ -118,33 +120,39 @@ def stream_wires(cell: CellFile, job: JobFile, folder: Path, far: FarEnd) -> dic
     if (config := cell.stereo or cell.camera) is not None:
         wire: PtySerial = SteadyPty(far.loop, config.baud)
         wire.open()
+        end = wire if far.transcript is None else TranscribedSpeed(wire, far.transcript, "camera")
         if cell.stereo is not None:
-            simulated_pair(cell, job, far, wire)
+            simulated_pair(cell, job, far, end)
         else:
-            simulated_camera(cell, job, folder, far, wire)
+            simulated_camera(cell, job, folder, far, end)
         far.devices.append(wire)
         found["camera"] = wire.path
     if cell.inertial is not None:
         wire = PtySerial(far.loop, cell.inertial.baud)
         wire.open()
-        simulated_inertial(far, wire, cell.inertial.mount_pose)
+        at = wire if far.transcript is None else TranscribedDevice(wire, far.transcript, "inertial")
+        simulated_inertial(far, at, cell.inertial.mount_pose)
         far.devices.append(wire)
         found["inertial"] = wire.path
     return found
 
 
-def streams_of(cell: CellFile, folder: Path, found: Mapping[str, object]) -> LiveStreams:
-    """The sensors of the cell file, on their ports or on those of simulated devices."""
-    streams = LiveStreams(_camera_at(cell, folder, camera_port(cell, found)))
+def streams_of(
+    cell: CellFile, folder: Path, found: Mapping[str, object], transcript: Transcript | None = None
+) -> LiveStreams:
+    """The sensors of the cell file, on their ports or on those of simulated devices; `transcript` gets all bytes."""
+    streams = LiveStreams(_camera_at(cell, folder, camera_port(cell, found), transcript))
     if cell.inertial is not None:
-        streams.inertial = _inertial_at(cell, cell.inertial, inertial_port(cell.inertial, found))
+        streams.inertial = _inertial_at(cell, cell.inertial, inertial_port(cell.inertial, found), transcript)
     return streams
 
 
 Sensor = tuple[str, str, PointStream | InertialSensor]
 
 
-def sensors_of(cell: CellFile, folder: Path, found: Mapping[str, object]) -> list[Sensor]:
+def sensors_of(
+    cell: CellFile, folder: Path, found: Mapping[str, object], transcript: Transcript | None = None
+) -> list[Sensor]:
     """Every sensor of the cell file that streams, whether `[live]` uses it or not: name, port, driver.
 
     Raises FileUnreadable for a tool definition that cannot be read.
@@ -152,10 +160,10 @@ def sensors_of(cell: CellFile, folder: Path, found: Mapping[str, object]) -> lis
     sensors: list[Sensor] = []
     if cell.stereo is not None or cell.camera is not None:
         port = camera_port(cell, found)
-        sensors.append((CAMERA, port, _camera_at(cell, folder, port)))
+        sensors.append((CAMERA, port, _camera_at(cell, folder, port, transcript)))
     if cell.inertial is not None:
         port = inertial_port(cell.inertial, found)
-        sensors.append((INERTIAL, port, _inertial_at(cell, cell.inertial, port)))
+        sensors.append((INERTIAL, port, _inertial_at(cell, cell.inertial, port, transcript)))
     return sensors
 
 
@@ -167,13 +175,17 @@ def inertial_port(config: InertialConfig, found: Mapping[str, object]) -> str:
     return str(found.get("inertial", config.port))
 
 
-def _camera_at(cell: CellFile, folder: Path, port: str) -> PointStream:
-    link = SerialPort(port, _first_baud(cell), CAMERA)
+def _heard(link: SerialPort, transcript: Transcript | None, wire: str) -> SpeedLink:
+    return link if transcript is None else TranscribedSerial(link, transcript, wire)
+
+
+def _camera_at(cell: CellFile, folder: Path, port: str, transcript: Transcript | None) -> PointStream:
+    link = _heard(SerialPort(port, _first_baud(cell), CAMERA), transcript, "camera")
     return pair_of(cell.stereo, link) if cell.stereo is not None else camera_of(cell, folder, link)
 
 
-def _inertial_at(cell: CellFile, config: InertialConfig, port: str) -> InertialSensor:
-    return inertial_of(cell, SerialPort(port, config.baud, INERTIAL))
+def _inertial_at(cell: CellFile, config: InertialConfig, port: str, transcript: Transcript | None) -> InertialSensor:
+    return inertial_of(cell, _heard(SerialPort(port, config.baud, INERTIAL), transcript, "inertial"))
 
 
 def _camera(cell: CellFile) -> NdiConfig:

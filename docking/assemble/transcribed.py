@@ -7,10 +7,10 @@ from collections.abc import Callable
 from docking.ports import CanFrame
 from docking.transcript import Transcript
 from sim.wires.can_frames import CanEnd
-from sim.wires.pacing import DeviceEnd
+from sim.wires.pacing import DeviceEnd, SpeedEnd
 
 
-def _ignore(_: object) -> None:
+def _ignore(*_: object) -> None:
     """Until the device listens."""
 
 
@@ -29,6 +29,23 @@ class TranscribedDevice:
     def _arrived(self, data: bytes) -> None:
         self._transcript.serial(self._name, True, data)
         self.on_bytes(data)
+
+
+class TranscribedSpeed(TranscribedDevice):
+    """The same for a device that changes the speed of its line."""
+
+    def __init__(self, wire: SpeedEnd, transcript: Transcript, name: str) -> None:
+        super().__init__(wire, transcript, name)
+        self.on_break: Callable[[], None] = _ignore
+        self._speed = wire
+        wire.on_break = self._broke
+
+    def set_baud(self, baud: int) -> None:
+        """As the wire does."""
+        self._speed.set_baud(baud)
+
+    def _broke(self) -> None:
+        self.on_break()
 
 
 class TranscribedStation:

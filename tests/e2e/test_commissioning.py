@@ -50,8 +50,21 @@ def test_every_device_of_a_simulated_cell_answers(name, count, skew, capsys, tmp
     assert any(not line.sent for line in lines)
 
 
-def test_the_sensors_beside_the_tracker_are_asked_too(capsys):
-    assert call(["devices", str(CELLS / "lab-can-tracked.toml"), "--sim", "--json"]) == 0
+def test_the_sensors_beside_the_tracker_are_asked_too_and_heard_at_both_ends(capsys, tmp_path):
+    cell = CELLS / "lab-can-tracked.toml"
+    near, far = tmp_path / "near.txt", tmp_path / "far.txt"
+    with served(cell, tmp_path, "--transcript", str(far)) as wires:
+        there = ["--sim", "--wires", str(wires), "--json", "--transcript", str(near)]
+        assert call(["devices", str(cell), *there]) == 0
+    for wire in ("tracker", "camera", "inertial"):
+        for sent in (True, False):
+            ends = [
+                b"".join(line.data for line in read_transcript(path) if line.wire == wire and line.sent is sent)
+                for path in (near, far)
+            ]
+            # The sensor streams from the moment it has power; the driver has opened its port later.
+            assert ends[0]
+            assert ends[1].endswith(ends[0]) or (not sent and ends[0] in ends[1]), wire
     rows = {row["where"]: row for row in told(capsys)["devices"]}
     assert rows["camera"]["vendor"] == "NDI"
     assert rows["inertial sensor"]["vendor"] == "VectorNav"

@@ -147,6 +147,30 @@ def test_wrong_length_and_toggle() -> None:
     run_virtual(main)
 
 
+def test_a_text_of_another_length_than_announced_or_without_an_end_is_not_taken() -> None:
+    async def main() -> None:
+        wire = Wire()
+        wire.twist = lambda answer: answer[:4] + b"\x05\0\0\0" if answer[0] == 0x41 else answer
+        with pytest.raises(BadReply, match="5 bytes announced"):
+            await wire.client.read_bytes(MAP.objects["device_name"])
+        wire = Wire()
+        toggle = 0
+
+        def endless(answer: bytes) -> bytes:
+            nonlocal toggle
+            if answer[0] == 0x41:
+                return answer
+            toggle ^= 0x10
+            return bytes((toggle ^ 0x10,)) + b"endless"
+
+        wire.twist = endless
+        with pytest.raises(BadReply, match="does not end"):
+            await wire.client.read_bytes(MAP.objects["device_name"])
+        assert len(wire.sent) < 600
+
+    run_virtual(main)
+
+
 @pytest.mark.parametrize("turns", [0, 1, 3], ids=["in the same turn", "one turn later", "three turns later"])
 def test_the_answer_to_a_request_that_was_given_up_is_no_second_device(turns: int) -> None:
     async def main() -> None:

@@ -159,6 +159,35 @@ def test_a_late_answer_is_not_taken_for_the_next_one() -> None:
     on_line(scenario)
 
 
+STRAY = sealed("01 03 02 0064")
+"""What unit 1 answers to "read 0"; it must not pass for the answer to "read 5"."""
+
+
+def test_after_an_answer_of_another_unit_the_right_one_may_still_come() -> None:
+    async def scenario(bench: Bench) -> None:
+        def overtaken(frame: bytes) -> bytes:
+            bench.loop.call_later(0.006, bench.wire.far.write, STRAY)
+            return sealed("02 03 02 00C8")
+
+        bench.answer(overtaken)
+        with pytest.raises(BadReply, match="unit 2 answered for unit 1"):
+            await bench.one.read(0, 1)
+        bench.answer(lambda frame: frame)
+        assert await bench.one.read(5, 1) == bytes((0, 105))
+        assert bench.line.flushed_bytes == len(STRAY)
+
+    on_line(scenario)
+
+
+def test_an_answer_to_who_used_the_line_before_is_let_through_first() -> None:
+    async def scenario(bench: Bench) -> None:
+        bench.loop.call_later(0.003, bench.wire.far.write, STRAY)
+        assert await bench.one.read(5, 1) == bytes((0, 105))
+        assert bench.line.flushed_bytes == len(STRAY)
+
+    on_line(scenario)
+
+
 def test_a_pulled_cable_is_told_at_once_to_every_unit() -> None:
     async def scenario(bench: Bench) -> None:
         told: list[str] = []
