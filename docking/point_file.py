@@ -54,7 +54,8 @@ def _number(path: Path, line: int, column: str, text: str) -> float:
     """A finite decimal number in strict grammar, as `float` alone would also take nan, inf and 1_000."""
     value = float(text) if _NUMBER.fullmatch(text) else float("nan")
     if not (abs(value) <= _LARGEST_MM):
-        _bad(path, f"line {line}, column {column}: {text!r}", "a finite decimal number of mm is needed")
+        cause = f"more than {_LARGEST_MM:.0e} mm" if _NUMBER.fullmatch(text) else "a decimal number of mm is needed"
+        _bad(path, f"line {line}, column {column}: {text!r}", cause)
     if column in (*_SIGMAS, _WEIGHT) and not (value > 0.0):
         what = "a weight" if column == _WEIGHT else "a standard deviation"
         _bad(path, f"line {line}, column {column}: {text!r}", f"{what} is greater than zero")
