@@ -22,6 +22,7 @@ from drivers.load_cells import AnalogueLoadCells
 from drivers.weighed_axes import WeighedDrives
 
 STOPS: tuple[Use, ...] = ("emergency-stop", "protective-stop")
+HELD: tuple[Use, ...] = ("enabling-device",)
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,8 @@ class HomingPlan:
 def home_axes(request: HomeRequest, notify: Notify = unheard) -> dict[str, Any]:
     """Bring the positioners up, home the group, release them; what was done, as plain data.
 
-    Raises as `homing_plan`; HomingRefused where a load cell shows a component or a stop is pressed; else as
-    `CanopenPositioners.home`.
+    Raises as `homing_plan`; HomingRefused where a load cell shows a component, a stop is pressed or the enabling device
+    is not held; else as `CanopenPositioners.home`.
     """
     plan = homing_plan(request)
 
@@ -97,8 +98,7 @@ async def _home(plan: HomingPlan, ends: Ends, notify: Notify) -> dict[str, Any]:
         if reason := stop():
             raise HomingRefused(cell.name, reason, value="stop", limit="no stop")
         before = positioners.latest().position_mm.tolist()
-        notify("homing", axes=", ".join(plan.axes))
-        await positioners.home(plan.axes, stop)
+        await positioners.home(plan.axes, _announced(stop, lambda: notify("homing", axes=", ".join(plan.axes))))
         after = positioners.latest().position_mm.tolist()
     finally:
         if inputs is not None:
@@ -134,15 +134,34 @@ async def _release(positioners: CanopenPositioners) -> None:
 
 
 def _stops(asked: list[str], inputs: WiredInputs | None, config: InputsConfig | None) -> Callable[[], str | None]:
-    """Why the group is to halt: a person, or a stop that is wired; a silent module counts as pressed."""
-    names = [name for use in STOPS for name in (config.names(use) if config is not None else ())]
+    """Why the group is to halt: a person, a stop that is wired, an enabling device that is let go. A silent module
+    counts as pressed and as let go."""
+    stops, held = (config.names(*uses) if config is not None else () for uses in (STOPS, HELD))
 
     def reason() -> str | None:
         if asked:
             return asked[0]
         given = inputs.latest().given if inputs is not None else {}
-        pressed = [name for name in names if given.get(name) is not False]
-        return f"{pressed[0]} is pressed, or silent." if pressed else None
+        for name in stops:
+            if given.get(name) is not False:
+                return f"{name} is pressed, or silent."
+        for name in held:
+            if given.get(name) is not True:
+                return f"{name} is not held, or silent."
+        return None
+
+    return reason
+
+
+def _announced(stop: Callable[[], str | None], announce: Callable[[], None]) -> Callable[[], str | None]:
+    """`stop`; when it is first asked the axes are about to be enabled, and that is announced."""
+    said: list[bool] = []
+
+    def reason() -> str | None:
+        if not said:
+            said.append(True)
+            announce()
+        return stop()
 
     return reason
 

@@ -164,7 +164,9 @@ def test_the_shipped_cell_with_its_part_is_refused_whatever_is_said(
 ) -> None:
     cell = cell_copy(tmp_path, "lab-can-free", (".sim.toml", "part_on_balls = false", "part_on_balls = true"))
     assert call(["home", str(cell), "--sim", "--yes", *free]) == 1
-    assert "2137: A." in capsys.readouterr().err
+    out, err = capsys.readouterr()
+    assert "2137: A." in err
+    assert out.splitlines() == [tell("en", "bringing_up")], "nobody is told that axes move"
 
 
 @pytest.mark.parametrize("free", [(), ("--free",)], ids=["", "said to be free"])

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from docking.assemble.commissioning import _report, devices_text
+from docking.assemble.monitoring import _wired_forces
 from docking.assemble.simulated import make_far_end, truth_of, virtual_wires
+from docking.config.load import load_cell
 from docking.errors import DeviceSilent
 from drivers.canopen.look import BusLook
 from drivers.canopen.positioners import CanopenPositioners
@@ -20,6 +22,7 @@ from drivers.modbus_look import ModbusLook
 from sim.canopen.group import DriveGroup
 from sim.virtual_time import run_virtual
 from tests.support.dry_cell import CELLS, files
+from tests.support.weighed_cell import weighed_files
 
 READS = {2, 3, 4}
 
@@ -226,3 +229,19 @@ def test_what_is_told_names_what_is_missing_and_what_is_too_much():
         "NOT IN",
     ):
         assert words in text
+
+
+@pytest.mark.parametrize(
+    ("ma", "force_n"),
+    [(12.0, 0.0), (16.0, 250.0), (3.9, -506.25), (3.7, None), (20.6, None), (0.0, None), (23.0, None), (None, None)],
+)
+def test_a_current_that_means_no_force_is_not_shown_as_one(ma, force_n, tmp_path):
+    """Range 500 N along Z; counts 5530 at 4 mA and 27648 at 20 mA."""
+    cell = load_cell(weighed_files(tmp_path, "lab-can"))
+    counts = None if ma is None else round(5530 + (27648 - 5530) * (ma - 4.0) / 16.0)
+    shown = _wired_forces(cell, {"force_B": (b"", (0, 0, counts))})
+    if force_n is None:
+        assert math.isnan(shown["B.Z"])
+    else:
+        assert shown["B.Z"] == pytest.approx(force_n, abs=0.05)
+    assert math.isnan(shown["A.Z"]), "its module did not answer"
