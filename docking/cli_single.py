@@ -7,7 +7,17 @@ from pathlib import Path
 import click
 
 from docking.errors import EXIT_OK
-from docking.terminal import FILE, ask_before, json_option, language, notifier, print_json, print_text, wire_choice
+from docking.terminal import (
+    FILE,
+    ask_before,
+    json_option,
+    language,
+    notifier,
+    print_json,
+    print_text,
+    transcript_option,
+    wire_choice,
+)
 from docking.words import tell
 
 
@@ -19,6 +29,7 @@ from docking.words import tell
 @click.option("--yes", is_flag=True, help="Do not ask.")
 @click.option("--sim", is_flag=True, help="Move a simulated axis on a real wire.")
 @click.option("--wires", type=FILE, help="Addresses that `docking sim` wrote; without it --sim starts its own devices.")
+@transcript_option
 @json_option
 def single(
     cell: Path,
@@ -28,6 +39,7 @@ def single(
     yes: bool,
     sim: bool,
     wires: Path | None,
+    transcript: Path | None,
     as_json: bool,
 ) -> int:
     """Move the single axis NAME of a CELL to TARGET_MM: a work platform or a gate, never anything that carries a part.
@@ -38,7 +50,8 @@ def single(
     from docking.assemble.looking import LookRequest
     from docking.assemble.single import SingleMove, move_single, single_axis
 
-    move = SingleMove(LookRequest(cell, wire_choice(sim, wires), language=language()), name, target_mm, speed)
+    look = LookRequest(cell, wire_choice(sim, wires), transcript=transcript, language=language())
+    move = SingleMove(look, name, target_mm, speed)
     single_axis(move)
     if not (sim or yes):
         ask_before("single", tell(language(), "single_question", name=name, target_mm=target_mm))

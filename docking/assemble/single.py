@@ -10,15 +10,19 @@ from typing import Any
 
 from docking.assemble.looking import Ends, LookRequest, Notify, load_looked_at, unheard, wires_of
 from docking.assemble.real_time import run_real
+from docking.assemble.timed import TimedSerial
 from docking.config import CellFile
 from docking.config.cell import SingleAxis
 from docking.errors import BadArgument, DockingError
+from docking.ports import SerialLink
+from docking.transcript import TranscribedSerial
 from drivers.links.serial_port import SerialPort
 from drivers.look import Found
 from drivers.modbus_rtu import RtuLine
 from drivers.numerical_drive import DriveState, NumericalDrive, load_numerical_map
 
 NO_WATCHDOG = "none: it goes on to its target when the controller falls silent"
+ROUND_TRIPS = 5
 MARGIN_S = 2.0
 """By which a move may outlast its way at its speed."""
 
@@ -60,7 +64,7 @@ def move_single(move: SingleMove, notify: Notify = unheard) -> dict[str, Any]:
     name, target_mm = move.name, move.target_mm
 
     async def main() -> dict[str, Any]:
-        async with wires_of(move.look, cell) as ends, _drive(axis, ends) as drive:
+        async with wires_of(move.look, cell) as ends, _drive(axis, _line(axis, ends)) as drive:
             before = await drive.read()
             within_s = abs(target_mm - before.position_mm) / speed + speed / axis.a_mm_s2 + MARGIN_S
             notify("single_moving", name=name, before_mm=before.position_mm, target_mm=target_mm, speed_mm_s=speed)
@@ -80,14 +84,15 @@ async def look_at_singles(cell: CellFile, ends: Ends) -> list[Found]:
 
 
 async def _look(axis: SingleAxis, ends: Ends) -> Found:
-    address = f"{axis.line} unit {axis.unit}, {axis.map}"
+    address, timed = f"{axis.line} unit {axis.unit}, {axis.map}", TimedSerial(_line(axis, ends))
     try:
-        async with _drive(axis, ends) as drive:
-            state = await drive.read()
+        async with _drive(axis, timed) as drive:
+            for _ in range(ROUND_TRIPS):
+                state = await drive.read()
     except DockingError as error:
-        return Found(f"single axis {axis.name}", address, problem=error)
+        return Found(f"single axis {axis.name}", address, round_trips_s=tuple(timed.taken_s), problem=error)
     units = f"stands at {state.position_mm:.2f} mm"
-    return Found(f"single axis {axis.name}", address, None, _words(state), units, NO_WATCHDOG)
+    return Found(f"single axis {axis.name}", address, None, _words(state), units, NO_WATCHDOG, tuple(timed.taken_s))
 
 
 def _words(state: DriveState) -> str:
@@ -104,13 +109,18 @@ def _axis(cell: CellFile, name: str) -> SingleAxis:
     return known[name]
 
 
-@contextlib.asynccontextmanager
-async def _drive(axis: SingleAxis, ends: Ends) -> AsyncIterator[NumericalDrive]:
-    """The drive of an axis, its line open. Raises PortMissing."""
+def _line(axis: SingleAxis, ends: Ends) -> SerialLink:
+    """The line of an axis; its bytes go to the transcript."""
     served = ends.singles.get(axis.line)
     # The pseudo-terminal of simulated devices has no parity to set.
     framing = axis.framing if served is None else "8N1"
     link = SerialPort(served or axis.line, axis.baud, f"single axis {axis.name}", framing)
+    return link if ends.transcript is None else TranscribedSerial(link, ends.transcript, f"single:{axis.name}")
+
+
+@contextlib.asynccontextmanager
+async def _drive(axis: SingleAxis, link: SerialLink) -> AsyncIterator[NumericalDrive]:
+    """The drive of an axis, its line open. Raises PortMissing."""
     unit = RtuLine(link, f"single axis {axis.name}", axis.baud, axis.timeout_s).unit(axis.name, axis.unit)
     await unit.connect()
     try:

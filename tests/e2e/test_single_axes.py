@@ -11,6 +11,7 @@ import pytest
 from docking.cli import call
 from docking.config.load import load_cell
 from docking.errors import ConfigInvalid
+from docking.transcript import read_transcript
 from docking.words import tell
 from tests.support.dry_cell import CELLS
 from tests.support.program import Terminal
@@ -45,13 +46,19 @@ def cell(tmp_path):
     return path
 
 
-def test_they_are_found_with_what_they_lack(cell, capsys):
-    assert call(["devices", str(cell), "--sim", "--json"]) == 0
+def test_they_are_found_with_what_they_lack(cell, capsys, tmp_path):
+    transcript = tmp_path / "bytes.txt"
+    assert call(["devices", str(cell), "--sim", "--json", "--transcript", str(transcript)]) == 0
     rows = {row["where"]: row for row in json.loads(capsys.readouterr().out)["devices"]}
     for name in ("platform", "gate"):
         row = rows[f"single axis {name}"]
         assert row["state"] == "servo on, homed"
         assert "goes on" in row["watchdog"]
+        assert row["round_trip_ms"] > 0.0
+        heard = [line for line in read_transcript(transcript) if line.wire == f"single:{name}"]
+        asked = [line.data[:2] for line in heard if line.sent]
+        assert asked == [bytes((3 + (name == "gate"), 3))] * 5, "reads of its unit and nothing else"
+        assert any(not line.sent for line in heard)
 
 
 def test_one_is_moved_and_says_that_it_is_there(cell, capsys):
