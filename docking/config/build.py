@@ -17,7 +17,7 @@ from docking.planning import (
     outline_edges,
 )
 from docking.planning.relief import LoadCellErrors, ReliefSettings
-from docking.planning.settings import READINGS, WINDOW
+from docking.planning.settings import READINGS
 from docking.types import Array, readonly
 
 STANDARD_GRAVITY_M_S2 = 9.80665
@@ -129,20 +129,21 @@ def plan_settings(cell: CellFile, job: JobFile) -> PlanSettings:
 
 def jam_settings(cell: CellFile) -> JamSettings:
     """How soon a jammed axis is met: two cycles of the bus, or two scans of the positioners, and the servos' lag; one
-    that holds a force, as soon as the monitors' window of read-backs or its load cell shows it."""
+    that holds a force, as soon as its encoder or its load cell shows it."""
     limits, bus = cell.limits, cell.bus
     period_s = bus.poll_s if isinstance(bus, ModbusBus) else bus.cycle_s
     queued = isinstance(bus, ModbusBus)
     twice_s = 2.0 * (bus.scan_s if isinstance(bus, ModbusBus) else bus.cycle_s)
     return JamSettings(
         stuck_mm=limits.stuck_mm,
+        passive_mm=limits.passive_mm,
         reaction_s=twice_s + bus.servo_lag_s,
         quick_floor_s=twice_s if queued else 0.0,
-        window_s=WINDOW * period_s,
         readings_s=READINGS * LOAD_CELL_CYCLES * period_s,
         residual_mm=limits.ball_residual_mm,
         force_n=limits.internal_force_n,
         warp_n=limits.warp_force_n,
+        held_warp_n=limits.measured_warp_n,
     )
 
 

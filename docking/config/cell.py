@@ -183,9 +183,14 @@ class LimitsConfig(Model):
         default=0.02, description="stop when an axis that was told to stand moves farther than this, mm"
     )
     passive_mm: Positive = Field(
+        default=0.1,
+        description="stop when an axis that follows the component stays behind by more than this, mm; play and "
+        "friction are inside. Bounds the speed of a plan",
+    )
+    adrift_mm: Positive = Field(
         default=0.5,
-        description="stop when a passive axis is farther than this from where the component takes it, mm; the slack "
-        "of its friction is inside",
+        description="stop when an axis that follows the component has with time come farther than this from where the "
+        "component takes it; brake when one that holds a force has, as it has lost its ball; mm",
     )
     sync_error_mm: Positive = Field(
         default=0.05,

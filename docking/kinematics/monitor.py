@@ -18,7 +18,7 @@ class Coupling(NamedTuple):
     """What axis deviations mean for the part: the largest of each kind.
 
     `residual_mm` and `rms_mm` of the balls against a rigid figure, `force_n` at a ball, `warp_n` of the vertical axes,
-    `pair_mm` change of the distance of two balls, `passive_mm` of a passive axis from where the component takes it.
+    `pair_mm` change of the distance of two balls.
     """
 
     residual_mm: float
@@ -26,7 +26,6 @@ class Coupling(NamedTuple):
     warp_n: float
     rms_mm: float
     pair_mm: float
-    passive_mm: float
 
 
 class CouplingMonitor:
@@ -64,12 +63,12 @@ class CouplingMonitor:
             max(map(abs, self._warp.tolist()), default=0.0),
             math.sqrt(sum(residuals) / self._balls),
             max(map(abs, self._pairs.tolist())),
-            max(map(abs, self._passive.tolist()), default=0.0),
         )
 
-    def worst_passive(self) -> int:
-        """The axis with the largest passive deviation of the last evaluation."""
-        return int(self.free[int(np.argmax(np.abs(self._passive)))])
+    @property
+    def beside_mm(self) -> Array:
+        """How far each axis of `free` (a,) is from where the component takes it, of the last evaluation."""
+        return self._passive
 
 
 def coupling_monitor(

@@ -6,9 +6,10 @@ that `v t / 2 = v^2 / (2 a_quick)` for the fastest axis. Each mm of it costs `c`
 `G` newton there (column of the internal-force matrix) and `W` newton of warp. An axis that ramps down as fast as the
 others parts by v r only.
 
-An axis that holds a force has no set-point to hang back from. Jammed, it holds a position: its force leaves its
-tolerance after `tolerance / G` mm, which two readings of its load cell in a row must show; where the plan takes it
-by `seen_mm` in the window of the encoders or faster, they show it first. The slower of the two has the longer way.
+An axis that follows the part has no set-point to hang back from. Jammed, it holds a position: it is seen where it
+stands `passive_mm` behind the place to which the others take it. One that holds a force is seen by its load cell, too:
+after `tolerance / G` mm its force leaves its tolerance, which two readings in a row must show; what comes first
+counts.
 """
 
 from __future__ import annotations
@@ -73,16 +74,20 @@ def warp_matrix(positioners: Positioners, balls_W_mm: Array, up: Array) -> Array
 
 @dataclass(frozen=True, eq=False)
 class JamBound:
-    """Cost of each axis's error (m,): `residual_per_mm`, `force_per_mm`, `warp_per_mm`; zero for axes without power.
+    """Cost of each axis's error (m,): `residual_per_mm`, `force_per_mm`, `warp_per_mm`; of an axis that follows,
+    once it jams.
 
-    `tolerance_mm` (m,): how far an axis that holds a force is out before its load cell shows it, NaN for the others.
+    `seen_mm` (m,): how far an axis is out before its encoder shows that it jams; `tolerance_mm` (m,) before the load
+    cell of one that holds a force does, NaN for the others. `driven` (m,): those that have a set-point.
     """
 
     axes: tuple[str, ...]
     residual_per_mm: Array
     force_per_mm: Array
     warp_per_mm: Array
+    seen_mm: Array
     tolerance_mm: Array
+    driven: NDArray[np.bool_]
     a_quick_mm_s2: Array
     settings: JamSettings
 
@@ -92,18 +97,16 @@ class JamBound:
 
     def reach_mm(self, speed_mm_s: Array) -> Array:
         """How far (m,) the others carry on past each axis that jams at `speed_mm_s` (m,) or slower."""
-        jam = self.settings
-        after_s = jam.reaction_s + 0.5 * self.quick_stop_s(speed_mm_s)
-        reach: Array = jam.stuck_mm + speed_mm_s * after_s
-        if not self._followers.any():
-            return reach
-        held = np.maximum(self._by_load_cell_mm(speed_mm_s, after_s), speed_mm_s * (jam.window_s + after_s))
-        result: Array = np.where(self._followers, held, reach)
+        after_s = self.settings.reaction_s + 0.5 * self.quick_stop_s(speed_mm_s)
+        by_encoder = self.seen_mm + speed_mm_s * after_s
+        by_load_cell = self.tolerance_mm + speed_mm_s * (self.settings.readings_s + after_s)
+        result: Array = np.fmin(by_encoder, by_load_cell)
         return result
 
     def ramp_mm(self, speed_mm_s: Array) -> Array:
-        """Residual (m,) when one axis begins to ramp down by itself at `speed_mm_s` (m,)."""
-        return self.residual_per_mm * speed_mm_s * self.settings.reaction_s
+        """Residual (m,) when one axis begins to ramp down by itself at `speed_mm_s` (m,); one without power cannot."""
+        powered = self.driven | ~np.isnan(self.tolerance_mm)
+        return self.residual_per_mm * powered * speed_mm_s * self.settings.reaction_s
 
     def jam_mm(self, speed_mm_s: Array) -> Array:
         """Residual (m,) of each axis jammed at `speed_mm_s` (m,)."""
@@ -126,46 +129,29 @@ class JamBound:
         found = []
         for cost, limit, what in self._limits():
             room = np.divide(limit, cost, out=np.full_like(cost, _FREE_MM), where=cost > 1e-9)
-            factor = self._factor(speed_mm_s, room, cost, (limit, what))
+            self._check_room(room, cost, limit, what)
+            factor = self._factor(speed_mm_s, room)
             k = int(np.argmax(factor))
             found.append((float(factor[k]), f"{self.axes[k]} jammed: {what}"))
         return found
 
-    @property
-    def _followers(self) -> NDArray[np.bool_]:
-        result: NDArray[np.bool_] = ~np.isnan(self.tolerance_mm)
-        return result
+    def _limits(self) -> Iterator[tuple[Array, Array, str]]:
+        """The tolerance of a held force is most of what a part may warp: load cells' limit bounds what its jam does."""
+        jam, every = self.settings, np.ones(len(self.axes))
+        yield self.residual_per_mm, jam.residual_mm * every, "ball residual"
+        yield self.force_per_mm, jam.force_n * every, "internal force"
+        yield self.warp_per_mm, np.where(np.isnan(self.tolerance_mm), jam.warp_n, jam.held_warp_n), "warp"
 
-    def _limits(self) -> Iterator[tuple[Array, float, str]]:
-        """The tolerance of a held force is most of what a part may warp: no speed keeps a jammed follower inside it."""
+    def _factor(self, v: Array, room: Array) -> Array:
         jam = self.settings
-        yield self.residual_per_mm, jam.residual_mm, "ball residual"
-        yield self.force_per_mm, jam.force_n, "internal force"
-        yield np.where(self._followers, 0.0, self.warp_per_mm), jam.warp_n, "warp"
-
-    def _by_load_cell_mm(self, v: Array, after_s: Array | float) -> Array:
-        """Reach (m,) of a jam that the encoders do not show: no faster than they need."""
-        jam = self.settings
-        slow = np.minimum(v, jam.seen_mm / jam.window_s)
-        result: Array = self.tolerance_mm + slow * (jam.readings_s + after_s)
-        return result
-
-    def _factor(self, v: Array, room: Array, cost: Array, limit: tuple[float, str]) -> Array:
-        jam = self.settings
-        least = np.where(self._followers, np.nan_to_num(self.tolerance_mm), jam.stuck_mm)
-        self._check_room(room, least, cost, limit)
-        factor = self._shrunk(v, room - jam.stuck_mm, jam.reaction_s)
-        if not self._followers.any():
-            return factor
-        held = np.maximum(self._shrunk(v, room, jam.window_s + jam.reaction_s), 1e-9)
-        # At the speed that the encoder's window allows, what jams more slowly must be inside as well.
-        ramp_s = np.maximum(jam.quick_floor_s, float(np.max(v / self.a_quick_mm_s2)) / held)
-        over = ~(self._by_load_cell_mm(v / held, jam.reaction_s + 0.5 * ramp_s) <= room)
-        slow = self._shrunk(v, room - np.nan_to_num(self.tolerance_mm), jam.readings_s + jam.reaction_s)
-        result: Array = np.where(self._followers, np.where(over, np.maximum(held, slow), held), factor)
+        by_encoder = self._shrunk(v, room - self.seen_mm, jam.reaction_s)
+        by_load_cell = self._shrunk(v, room - self.tolerance_mm, jam.readings_s + jam.reaction_s)
+        result: Array = np.fmin(by_encoder, by_load_cell)
         return result
 
     def _shrunk(self, v: Array, room: Array, reaction_s: float) -> Array:
+        """Stretch (m,) with which an axis stays inside `room` (m,) mm; next to endless where there is none."""
+        room = np.maximum(room, 1.0 / _FREE_MM)
         ramp_s = float(np.max(v / self.a_quick_mm_s2))
         run = v * reaction_s
         shrinking = (run + np.sqrt(run * run + 2.0 * room * v * ramp_s)) / (2.0 * room)
@@ -173,14 +159,16 @@ class JamBound:
         result: Array = np.maximum(shrinking, at_floor)
         return result
 
-    def _check_room(self, room: Array, least_mm: Array, cost: Array, limit: tuple[float, str]) -> None:
+    def _check_room(self, room: Array, cost: Array, limit: Array, what: str) -> None:
         """What is reached before anybody can see it must leave room. Raises StrainForeseen."""
+        least_mm = np.fmin(self.seen_mm, self.tolerance_mm)
         k = int(np.argmin(room - least_mm))
         if not room[k] > least_mm[k]:
-            where = f"{self.axes[k]} jammed: {limit[1]}"
-            name = "limits.stuck_mm" if np.isnan(self.tolerance_mm[k]) else "out of tolerance in mm"
-            cause = f"At any speed: {name} = {least_mm[k]:g}; less than {room[k]:.4g} mm would fit."
-            raise StrainForeseen(where, cause, value=float(cost[k] * least_mm[k]), limit=limit[0])
+            key = "limits.stuck_mm" if self.driven[k] else "limits.passive_mm"
+            key = key if least_mm[k] == self.seen_mm[k] else "force_tolerance in mm"
+            cause = f"At any speed: {key} = {least_mm[k]:.4g}; less than {room[k]:.4g} mm would fit."
+            value = float(cost[k] * least_mm[k])
+            raise StrainForeseen(f"{self.axes[k]} jammed: {what}", cause, value=value, limit=float(limit[k]))
 
 
 def jam_bound(positioners: Positioners, q_mm: Array, settings: JamSettings, up: Array) -> JamBound:
@@ -188,17 +176,21 @@ def jam_bound(positioners: Positioners, q_mm: Array, settings: JamSettings, up: 
     them. The start, the middle and the end of a path are enough for the few degrees of a docking."""
     places = [_costs(positioners, socket_positions(positioners, row), up) for row in np.atleast_2d(q_mm)]
     residual, force, warp = np.max(places, axis=0)
-    followers = positioners.followers
     tolerance = np.divide(
-        positioners.held_tolerance_n, force, out=np.full_like(force, np.nan), where=followers & (force > 0.0)
+        positioners.held_tolerance_n,
+        force,
+        out=np.full_like(force, np.nan),
+        where=positioners.followers & (force > 0.0),
     )
-    return JamBound(positioners.axes, residual, force, warp, tolerance, positioners.a_quick_mm_s2, settings)
+    seen = np.where(positioners.driven, settings.stuck_mm, settings.passive_mm)
+    costs = residual, force, warp, seen, tolerance
+    return JamBound(positioners.axes, *costs, positioners.driven, positioners.a_quick_mm_s2, settings)
 
 
 def _costs(positioners: Positioners, balls_W_mm: Array, up: Array) -> Array:
-    """Residual, force and warp (3, m) per mm of each axis; one that holds a force holds a position once it jams."""
+    """Residual, force and warp (3, m) per mm of each axis; one that follows holds a position once it jams."""
     costs = _held_costs(positioners, balls_W_mm, up)
-    for k in np.flatnonzero(positioners.followers):
+    for k in np.flatnonzero(~positioners.driven):
         others = np.arange(len(positioners.axes)) != k
         jammed = replace(
             positioners,

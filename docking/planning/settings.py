@@ -9,10 +9,6 @@ import numpy as np
 from docking.kinematics import Load
 from docking.types import Array
 
-WINDOW = 5
-"""Read-backs over which what an axis was to do and what its encoder shows are compared."""
-WINDOW_MM = 0.05
-"""Travel that was to be made in the window from which on the encoder must show it."""
 READINGS = 2
 """Readings of a load cell in a row that must show a force to be wrong."""
 
@@ -21,21 +17,22 @@ READINGS = 2
 class JamSettings:
     """How soon a jammed axis is met, and what it may cost.
 
-    It is seen when it hangs back by `stuck_mm` more than its lag; the others go on for `reaction_s` and then ramp down
-    with the axes' a_quick, in `quick_floor_s` at least. An axis that holds a force is seen by its encoder within
-    `window_s` where it is to go `seen_mm` in that time, and by its load cell within `readings_s` of leaving its
-    tolerance. `residual_mm` and `force_n` at the worst ball and `warp_n` are the limits.
+    It is seen when it hangs back by `stuck_mm` more than its lag, one without a set-point when it stands `passive_mm`
+    behind its place; the others go on for `reaction_s` and then ramp down with the axes' a_quick, in `quick_floor_s` at
+    least. An axis that holds a force is also seen by its load cell, within `readings_s` of leaving its tolerance.
+    `residual_mm` and `force_n` at the worst ball and `warp_n` are the limits; `held_warp_n` where an axis that holds a
+    force jams.
     """
 
     stuck_mm: float = 0.02
+    passive_mm: float = 0.1
     reaction_s: float = 0.022
     quick_floor_s: float = 0.0
-    window_s: float = 0.05
-    seen_mm: float = WINDOW_MM
     readings_s: float = 0.2
     residual_mm: float = 0.1
     force_n: float = 1500.0
     warp_n: float = 300.0
+    held_warp_n: float = 600.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,9 @@ from docking.cli import call
 from tests.support.program import CELLS, cell_copy
 
 LAB = CELLS / "lab-can.toml"
-NAMES = ("fuselage-can", "fuselage-modbus", "follower-can", "wing-modbus", "lab-can", "lab-modbus")
+NAMES = (
+    "fuselage-can", "fuselage-modbus", "follower-can", "follower-force-can", "wing-modbus", "lab-can", "lab-modbus",
+)  # fmt: skip
 
 
 def planned(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, dict[str, Any]]:

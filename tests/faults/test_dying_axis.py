@@ -131,6 +131,10 @@ def test_ax_08_an_axis_that_ramps_down_by_itself_takes_the_others_along(name, ax
     assert outcome.reaction == "quick-stop"
     assert outcome.reacted_s <= 2.0 * CYCLE_S
     assert outcome.residual_mm <= BY_RAMP_MM
+    # What comes next is planned from where the drives' own ramps have led, not from the last set-point.
+    assert cell.result is not None
+    stand = cell.recorded.ticks[-1].motor_mm
+    assert np.abs(cell.result.commanded_mm - stand)[np.array(AXES) != axis].max() <= 0.002
     assert outcome.force_n <= cell.cell.limits.internal_force_n
 
 

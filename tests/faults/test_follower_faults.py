@@ -1,4 +1,7 @@
-"""D.Z of `follower-force-can` holds its force through a move; jammed or without its ball it stops all axes."""
+"""D.Z of `follower-force-can` holds its force through a move; jammed or without its ball it stops all axes.
+
+A guide without power that jams strains the part no more than the pre-flight stated.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from docking.errors import AxisDrift, AxisStuck, BallUnloaded, EncoderJump
+from docking.errors import AxisDrift, AxisStuck, BallUnloaded, DockingError, EncoderJump, PassiveAxisTrip
 from docking.types import Array, Plan
 from tests.support.motion_record import AS_SENT_MM, along
 from tests.support.planned_moves import a_shift, lab_site
@@ -19,8 +22,10 @@ K = 11
 Watched = list[tuple[float, float, float, float]]
 
 
-def move(scene: int | Scene, fault: str | None = None, share: float = 0.4) -> tuple[ReadyCell, Array]:
-    """One move, D.Z failing after 40 % of it; rows of time, force and position of D.Z, largest internal force."""
+def move(
+    scene: int | Scene, fault: str | None = None, share: float = 0.4, axis: str = "D.Z"
+) -> tuple[ReadyCell, Array]:
+    """One move, `axis` failing after 40 % of it; rows of time, force and position of D.Z, largest internal force."""
     seen: Watched = []
 
     def story(cell: ReadyCell) -> None:
@@ -35,7 +40,7 @@ def move(scene: int | Scene, fault: str | None = None, share: float = 0.4) -> tu
 
         cell.recorded.step = watched  # type: ignore[method-assign]
         if fault is not None:
-            cell.during(share, getattr(plant, fault), "D.Z")
+            cell.during(share, getattr(plant, fault), axis)
 
     if isinstance(scene, int):
         scene = Scene("follower-force-can", seed=scene)
@@ -82,9 +87,9 @@ class Lift:
 
 
 LIFTS = (
-    *(Lift(0.99, share) for share in (0.5, 0.505)),
     Lift(8.0, 0.48),
-    *(Lift(speed, share) for speed in (0.3, 0.6, 0.9, 1.05, 1.5, 2.5, 8.0) for share in (0.35, 0.51)),
+    Lift(0.3),
+    *(Lift(speed, share) for speed in (0.1, 0.2, 0.3, 0.5, 0.8, 8.0) for share in (0.35, 0.505)),
 )
 NOISE_N = 60.0
 """What read-backs in micrometres and friction make of forces, whatever the axes do."""
@@ -92,10 +97,12 @@ SPAN = 1.5
 """The stated bound may be this much above the worst that is measured, as for axes that hold a position."""
 
 
-@pytest.mark.parametrize(("seed", "kind", "within_s"), [(2, AxisStuck, 0.1), (3, BallUnloaded, 0.3)])
-def test_jammed_it_stops_all_axes_on_the_path(seed: int, kind: type[Exception], within_s: float) -> None:
-    """At 3 mm/s its encoder tells within the window, at 0.6 mm/s the load cell does with its second reading."""
-    cell, _ = move(seed, "jam")
+@pytest.mark.parametrize(
+    ("speed_mm_s", "kind", "within_s"), [(8.0, PassiveAxisTrip, 0.15), (0.1, BallUnloaded | PassiveAxisTrip, 0.85)]
+)
+def test_jammed_it_stops_all_axes_on_the_path(speed_mm_s: float, kind: type[DockingError], within_s: float) -> None:
+    """At 0.83 mm/s its encoder tells after 0.1 mm, at 0.1 mm/s its load cell may after 0.05 mm."""
+    cell, _ = move(Lift(speed_mm_s).scene(), "jam")
     assert isinstance(cell.cause, kind), repr(cell.cause)
     assert cell.cause.where == "D.Z"
     assert cell.result is not None
@@ -105,22 +112,60 @@ def test_jammed_it_stops_all_axes_on_the_path(seed: int, kind: type[Exception], 
 
 
 def test_jammed_at_any_speed_it_strains_no_more_than_the_pre_flight_stated(request: pytest.FixtureRequest) -> None:
-    """The worst speed is the one that its window just does not see; the load cell needs two readings there."""
+    """Internal force and, of four balls, warp: the force at the ball of one vertical axis is the warp."""
     whole, shares = request.config.getoption("--full"), []
-    for lift in LIFTS if whole else LIFTS[:3]:
+    for lift in LIFTS if whole else LIFTS[:2]:
         cell, rows = move(lift.scene(), "jam", lift.share)
         assert cell.cause is not None
         assert cell.plan.bounds is not None
-        stated_n = float(cell.plan.bounds.jam_n[K])
-        worst_n = float(rows[:, 3].max() - rows[rows[:, 0] < cell.fault_s, 3].max())
+        stated_n, warp_n = float(cell.plan.bounds.jam_n[K]), float(cell.plan.bounds.jam_warp_n[K])
+        worst_n = rise_n(cell, rows)
         peak = cell.plan.bounds.peak_mm_s[K]
         print(
             f"D.Z jammed at {peak:.2f} mm/s, {lift.share} of the way: {worst_n:.0f} of {stated_n:.0f} N; {cell.cause}"
         )
         assert worst_n <= stated_n + NOISE_N
-        assert stated_n <= 1.001 * cell.cell.limits.internal_force_n
+        assert warp_n == pytest.approx(stated_n, rel=0.01)
+        assert warp_n <= 1.001 * cell.cell.limits.measured_warp_n
         shares.append(stated_n / worst_n)
     assert min(shares) <= SPAN
+
+
+def rise_n(cell: ReadyCell, rows: Array) -> float:
+    """What the fault adds to the largest internal force of the move before it."""
+    return float(rows[:, 3].max() - rows[rows[:, 0] < cell.fault_s, 3].max())
+
+
+PLAY = ("ball_clearance", "backlash", "stick_slip", "repeatability")
+"""Play softens what the part feels; the bound must hold for a part that sits tight."""
+LEVEL = {"X": np.array([60.0, 0.0, 0.0]), "Y": np.array([0.0, 30.0, 0.0])}
+GUIDES = [
+    pytest.param(name, axis, speed, id=f"{name}-{axis}-{speed}", marks=[] if few else [pytest.mark.full])
+    for name in ("follower-can", "follower-force-can")
+    for axis in ("B.X", "C.X", "C.Y", "D.X", "D.Y")
+    for speed in (10.0, 0.5)
+    for few in [(name, axis, speed) in (("follower-can", "B.X", 10.0), ("follower-force-can", "C.Y", 10.0))]
+]
+
+
+@pytest.mark.parametrize(("name", "axis", "speed_mm_s"), GUIDES)
+def test_a_guide_without_power_that_jams_strains_no_more_than_stated(name: str, axis: str, speed_mm_s: float) -> None:
+    def lead(cell: ReadyCell) -> None:
+        shift = LEVEL[axis[-1]] * (1.0 if speed_mm_s > 1.0 else 0.1)
+        cell.plan_from = lambda standing: a_shift(lab_site(name), shift, speed_mm_s, standing)  # type: ignore[method-assign]
+
+    cell, rows = move(Scene(name, seed=2, before=lead, errors_off=PLAY), "jam", 0.5, axis)
+    assert isinstance(cell.cause, PassiveAxisTrip), repr(cell.cause)
+    assert cell.cause.where == axis
+    k, bounds = cell.index(axis), cell.plan.bounds
+    assert bounds is not None
+    stated_n, worst_n = float(bounds.jam_n[k]), rise_n(cell, rows)
+    print(f"{name} {axis} jammed at {bounds.peak_mm_s[k]:.2f} mm/s: {worst_n:.0f} of {stated_n:.0f} N; {cell.cause}")
+    assert worst_n <= stated_n + NOISE_N
+    assert stated_n <= min(SPAN * worst_n, 1.001 * cell.cell.limits.internal_force_n)
+    assert beside_the_path_mm(cell) < AS_SENT_MM
+    if speed_mm_s > 1.0:
+        assert cell.plan.speed_limited_by.endswith("jammed: internal force")
 
 
 def test_without_its_ball_in_a_move_it_stops_within_a_millimetre() -> None:

@@ -24,6 +24,7 @@ def watch_limits(cell: CellFile) -> WatchLimits:
         stuck_mm=limits.stuck_mm,
         standstill_mm=limits.standstill_mm,
         passive_mm=limits.passive_mm,
+        adrift_mm=limits.adrift_mm,
         ball_rms_mm=limits.ball_rms_mm,
         ball_pair_mm=limits.ball_pair_mm,
         sync_error_mm=limits.sync_error_mm,

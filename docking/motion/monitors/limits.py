@@ -9,11 +9,13 @@ from dataclasses import dataclass
 class WatchLimits:
     """Limits of the monitors (CELL file, `limits`): mm and N.
 
-    The following error may grow with the speed up to its ceiling. `measured_*` bound what the load cells show beyond
-    the expected reactions: the change since the move was loaded, and, wider because cells drift and cross-talk, the
-    whole (`measured_whole_*`); `standing_force_n` bounds the change while the axes stand, from load to start and from
-    hold to resume. `sync_error` bounds what path times apart may squeeze. `overload` and `underload` are
-    fractions of the expected load of a ball; the rating of an axis may be exceeded by `rating`.
+    The following error may grow with the speed up to its ceiling. `passive_mm` bounds how far an axis that follows the
+    part stays behind, `adrift_mm` how far from its place it may come with time; one that holds a force has then lost
+    its ball. `measured_*` bound what the load cells show beyond the expected reactions: the change since the move was
+    loaded, and, wider because cells drift and cross-talk, the whole (`measured_whole_*`); `standing_force_n` bounds the
+    change while the axes stand, from load to start and from hold to resume. `sync_error` bounds what path times apart
+    may squeeze. `overload` and `underload` are fractions of the expected load of a ball; the rating of an axis may be
+    exceeded by `rating`.
     """
 
     following_rest_mm: float
@@ -24,7 +26,8 @@ class WatchLimits:
     missing_cycles: float
     stuck_mm: float = 0.02
     standstill_mm: float = 0.02
-    passive_mm: float = 0.5
+    passive_mm: float = 0.1
+    adrift_mm: float = 0.5
     ball_rms_mm: float = 0.06
     ball_pair_mm: float = 0.15
     sync_error_mm: float = 0.05

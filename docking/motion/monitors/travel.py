@@ -10,11 +10,14 @@ from docking.errors import AxisDrift, AxisStuck, EncoderJump, FollowingErrorTrip
 from docking.kinematics import Positioners
 from docking.motion.monitors.limits import Margins, Timing, WatchLimits
 from docking.motion.triggers import Finding, Trigger
-from docking.planning.settings import WINDOW, WINDOW_MM
 from docking.types import Array, Feedback
 
 SLOWEST, FASTEST = 0.2, 2.0
 """Encoder travel as a fraction of the commanded: under it the axis is stuck, over it the encoder is not believed."""
+WINDOW = 5
+"""Read-backs over which what an axis was to do and what its encoder shows are compared."""
+WINDOW_MM = 0.05
+"""Travel that was to be made in the window from which on the encoder must show it."""
 HALF = 0.5
 JUMP = 2.0
 """An encoder cannot move faster than so many times the largest speed of its axis."""
@@ -137,7 +140,7 @@ class Travel:
         """An axis that holds a force goes where the component goes; anywhere else it has lost its ball and runs."""
         if not len(self._holds_force):
             return None
-        off, limit = (position_mm - q_ref_mm)[self._holds_force], self._limits.passive_mm
+        off, limit = (position_mm - q_ref_mm)[self._holds_force], self._limits.adrift_mm
         if self._margins.note("held_axis", float(np.abs(off).max()) / limit):
             return None
         k = int(np.argmin(np.abs(off) <= limit))

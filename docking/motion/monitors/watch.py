@@ -18,6 +18,7 @@ from docking.errors import (
     WarpTrip,
 )
 from docking.kinematics import Coupling, CouplingMonitor, Load, Positioners, coupling_monitor, socket_positions
+from docking.motion.monitors.followed import Followed
 from docking.motion.monitors.held import HeldForces
 from docking.motion.monitors.limits import Margins, Timing, WatchLimits
 from docking.motion.monitors.loads import BallLoads
@@ -28,7 +29,7 @@ from docking.types import Array, AxisState, FaultKind, Feedback
 LATE_IN_A_ROW = 2
 """Cycles in a row that go without the figure because a read-back is late, however many may be missed by one axis."""
 
-_NONE = Coupling(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+_NONE = Coupling(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class Watch:
@@ -55,6 +56,7 @@ class Watch:
         weighed = np.asarray(load_cells, dtype=np.bool_)
         self._loads = BallLoads(positioners, load, limits, weighed, self._margins)
         self._held = HeldForces(positioners, weighed, self._margins)
+        self._followed = Followed(limits.passive_mm)
         self._coupling: CouplingMonitor | None = None
         self._enabled: tuple[AxisState, ...] = ()
         self._late_in_a_row = 0
@@ -108,6 +110,7 @@ class Watch:
         """
         self._coupling = coupling_monitor(self._positioners, socket_positions(self._positioners, q_mm), self._up)
         self._travel.forget()
+        self._followed.begin()
         self._loads.about(q_mm, relief=relief)
         self._clean = None
 
@@ -255,17 +258,28 @@ class Watch:
             note("ball_pair", found.pair_mm / limits.ball_pair_mm),
             note("predicted_force", found.force_n / limits.internal_force_n),
             note("predicted_warp", found.warp_n / limits.warp_force_n),
-            note("passive_axis", found.passive_mm / limits.passive_mm),
         )
-        return None if all(inside) else self._strained(inside.index(False), off_mm)
+        if not all(inside):
+            return self._strained(inside.index(False), off_mm)
+        return self._follow(self._coupling, q_ref_mm) if len(self._coupling.free) else None
+
+    def _follow(self, coupling: CouplingMonitor, q_ref_mm: Array) -> Finding | None:
+        """Axes that follow the part: none is left behind by a jam, none has come off its place with time."""
+        limits, beside_mm = self._limits, coupling.beside_mm
+        left_mm = self._followed.off_mm(beside_mm, q_ref_mm[coupling.free])
+        for monitor, off_mm, limit in (
+            ("passive_axis", np.abs(left_mm), limits.passive_mm),
+            ("passive_place", np.abs(beside_mm), limits.adrift_mm),
+        ):
+            if not self._margins.note(monitor, float(off_mm.max()) / limit):
+                k = int(np.argmin(off_mm <= limit))
+                error = PassiveAxisTrip(self._axes[coupling.free[k]], value=float(off_mm[k]), limit=limit)
+                return Finding(Trigger.PASSIVE_AXIS, error)
+        return None
 
     def _strained(self, case: int, off_mm: Array) -> Finding:
         """The finding of the first figure that is over its limit."""
         found, limits, cause = self.coupling, self._limits, self._worst(off_mm)
-        if case == 5 and self._coupling is not None:
-            axis = self._axes[self._coupling.worst_passive()]
-            passive = PassiveAxisTrip(axis, value=found.passive_mm, limit=limits.passive_mm)
-            return Finding(Trigger.PASSIVE_AXIS, passive)
         trigger, kind, where, value, limit = (
             (Trigger.COUPLING, ConsistencyTrip, "ball centres", found.residual_mm, limits.ball_residual_mm),
             (Trigger.COUPLING, ConsistencyTrip, "ball centres, rms", found.rms_mm, limits.ball_rms_mm),

@@ -120,6 +120,21 @@ def test_a_read_back_that_is_no_number_is_no_rest():
     assert refused.value.where == "A.Y"
 
 
+def test_a_read_back_that_is_shown_again_says_nothing():
+    """The axes creep, and every read-back is shown for eight looks: seven of them look like rest."""
+
+    class Slow(Drifting):
+        def feedback(self):
+            now_s = 2.0 * int(asyncio.get_running_loop().time() / 2.0)
+            return read_back(self._position(now_s), t_s=now_s)
+
+    async def main() -> None:
+        await settle(Slow(lambda t: np.array([0.0] * 11 + [0.03 * t])), SettleSettings(1.0, 4, 0.005, 20.0))
+
+    with pytest.raises(NotSettled):
+        run_virtual(main)
+
+
 def test_the_wait_is_spread_over_the_window():
     times: list[float] = []
 

@@ -460,6 +460,10 @@ def test_a_move_that_nobody_waits_for_is_stopped_on_the_path(how):
             move.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await move
+            # Nobody closes anything: the stop follows from the cancelling alone.
+            await asyncio.sleep(0.4 * PLAN.duration_s)
+            np.testing.assert_array_equal(bench.bus.sent[-1], bench.bus.sent[-2])
+            assert np.abs(bench.bus.sent[-1] - PLAN.q_mm[-1]).max() > 0.1, "it ran to its end"
         await bench.motion.close()
         steps = np.abs(np.diff(np.array(bench.bus.sent), axis=0)).max(axis=1) / 0.01
         assert steps[-1] < 0.05 * steps.max(), "the last set-points before closing still move"

@@ -10,7 +10,6 @@ from docking.assemble.motion_side import lease_settings, service_settings
 from docking.config.build import LOAD_CELL_CYCLES, jam_settings
 from docking.config.cell import ModbusBus
 from docking.config.load import load_cell
-from docking.motion.monitors import travel
 from docking.motion.monitors.build import watch_limits
 from docking.motion.monitors.limits import WatchLimits
 from drivers.maps.objects import load_object_map
@@ -55,11 +54,10 @@ def test_load_cells_report_as_often_as_the_planner_counts_on() -> None:
     assert load_object_map("cia402").pdos["force"].transmission == LOAD_CELL_CYCLES
 
 
-def test_the_planner_counts_on_the_window_that_the_monitor_has() -> None:
+def test_the_planner_counts_on_the_limits_that_the_monitors_have() -> None:
     cell = load_cell(CELLS / "lab-can.toml")
-    jam = jam_settings(cell)
-    assert jam.window_s == pytest.approx(travel.WINDOW * cell.bus.cycle_s)
-    assert jam.seen_mm == travel.WINDOW_MM
-    assert jam.stuck_mm == watch_limits(cell).stuck_mm
-    assert (jam.force_n, jam.warp_n) == (watch_limits(cell).internal_force_n, watch_limits(cell).warp_force_n)
-    assert jam.residual_mm == watch_limits(cell).ball_residual_mm
+    jam, watch = jam_settings(cell), watch_limits(cell)
+    assert (jam.stuck_mm, jam.passive_mm) == (watch.stuck_mm, watch.passive_mm)
+    assert (jam.force_n, jam.warp_n) == (watch.internal_force_n, watch.warp_force_n)
+    assert jam.held_warp_n == watch.measured_warp_n
+    assert jam.residual_mm == watch.ball_residual_mm
