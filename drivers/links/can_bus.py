@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import threading
 from collections.abc import Callable
 
@@ -22,6 +23,29 @@ _BATCH = 256
 _LINE_STUCK_S = 0.005
 _BUS_OFF = 0x40
 """Error class of an error frame (linux/can/error.h)."""
+_GONE = (can.CanError, OSError)
+_NO_FRAME = (ValueError, IndexError)
+"""What the adapter sent cannot be taken apart."""
+_WORDS = {
+    errno.ENOENT: "no such device",
+    errno.ENODEV: "no such interface; `ip link` lists those that there are",
+    errno.ENETDOWN: "the interface is down: ip link set NAME up type can bitrate RATE",
+    errno.EAFNOSUPPORT: "this system has no SocketCAN",
+    errno.EACCES: "permission denied",
+    errno.EPERM: "permission denied",
+    errno.EBUSY: "another program holds it",
+    errno.ECONNREFUSED: "nobody serves it",
+}
+
+
+def _words(error: BaseException) -> str:
+    """The error as a short clause: by the system's number where there is one, else what was said."""
+    number = getattr(error, "errno", None) or getattr(error, "error_code", None)
+    if number in _WORDS:
+        return _WORDS[number]
+    said = str(error) or type(error).__name__
+    lacking = isinstance(error, NameError | AttributeError | ImportError)
+    return f"{said}; is the library of the adapter's maker installed?" if lacking else said
 
 
 def _ignore(_: object) -> None:
@@ -46,8 +70,9 @@ class CanBusLink:
         self._loop = asyncio.get_running_loop()
         try:
             bus = await asyncio.to_thread(self._open_bus)
-        except (can.CanError, OSError, ValueError, ImportError) as error:
-            raise PortMissing(f"bus {self._interface}", str(error), value=self._channel) from error
+        except Exception as error:
+            # Interfaces of python-can without their maker's library fail with NameError and TypeError, too.
+            raise PortMissing(f"bus {self._interface}", _words(error), value=self._channel) from error
         self._bus = bus
         self._watched = _descriptor(bus)
         if self._watched >= 0:
@@ -104,12 +129,8 @@ class CanBusLink:
         """On the loop: take everything that has arrived."""
         try:
             batch = _drain(bus)
-        except (can.CanError, OSError) as error:
-            self._lose(str(error))
-            return
-        except (ValueError, IndexError) as error:
-            # slcan lines that are no frame: python-can keeps what it could not decode before everything that follows.
-            self._lose(f"the adapter sends what is no frame: {error}")
+        except (*_GONE, *_NO_FRAME) as error:
+            self._lose(_why_lost(error))
             return
         self._deliver(batch)
 
@@ -128,8 +149,8 @@ class CanBusLink:
             try:
                 message = bus.recv(_WAIT_S)
                 batch = [] if message is None else [message, *_drain(bus)]
-            except (can.CanError, OSError) as error:
-                self._wake(self._lose, str(error), stopping)
+            except (*_GONE, *_NO_FRAME) as error:
+                self._wake(self._lose, _why_lost(error), stopping)
                 return
             if batch:
                 self._wake(self._deliver, batch, stopping)
@@ -140,6 +161,11 @@ class CanBusLink:
         except RuntimeError:
             # The loop has closed under the thread: nobody is left to tell.
             stopping.set()
+
+
+def _why_lost(error: BaseException) -> str:
+    # slcan lines that are no frame: python-can keeps what it could not decode before everything that follows.
+    return f"the adapter sends what is no frame: {error}" if isinstance(error, _NO_FRAME) else str(error)
 
 
 def _serial_line(channel: str, bitrate: int) -> can.BusABC:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 from collections.abc import Callable
 from pathlib import Path
 
 import can
+import can.interfaces.virtual
 import numpy as np
 import pytest
 
@@ -108,6 +110,47 @@ async def test_missing_bus_is_named(tmp_path: Path) -> None:
         with pytest.raises(PortMissing) as caught:
             await link.open()
         assert caught.value.value == channel
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (NameError("name 'canOpenChannel' is not defined"), "library of the adapter's maker"),
+        (TypeError("missing 2 required positional arguments"), "2 required"),
+        (OSError(errno.ENODEV, "No such device"), "ip link"),
+        (OSError(errno.ENETDOWN, "Network is down"), "ip link set NAME up"),
+        (can.CanInitializationError("cannot", errno.EACCES), "permission denied"),
+        (can.CanInitializationError("no bit rate"), "no bit rate"),
+    ],
+    ids=lambda value: type(value).__name__ if isinstance(value, Exception) else "",
+)
+async def test_whatever_way_an_interface_fails_it_is_named(
+    error: Exception, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(**_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(can, "Bus", refuse)
+    with pytest.raises(PortMissing) as caught:
+        await CanBusLink("kvaser", "0", 500_000).open()
+    assert caught.value.where == "bus kvaser"
+    assert told in caught.value.text()
+
+
+@pytest.mark.parametrize("error", [can.CanOperationError("adapter gone"), OSError(5, "gone"), ValueError("gone")])
+async def test_a_reading_thread_that_ends_tells_so(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Failing(can.interfaces.virtual.VirtualBus):
+        def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+            raise error
+
+    lost: list[str] = []
+    link = CanBusLink("virtual", "failing", 500_000)
+    link.on_lost = lost.append
+    monkeypatch.setattr(can, "Bus", lambda channel, **_: Failing(channel))
+    await link.open()
+    await until(lambda: bool(lost))
+    assert "gone" in lost[0]
+    assert ("no frame" in lost[0]) is isinstance(error, ValueError)
 
 
 async def test_losing_the_bus_while_it_is_brought_up(tmp_path: Path) -> None:
