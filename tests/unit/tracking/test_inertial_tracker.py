@@ -184,3 +184,21 @@ def test_rest_is_held_and_creeping_is_not_taken_for_rest_when_said_so() -> None:
     assert end(at_rest, place) < 1.0
     creeping = place + np.array([8.0, 0.0, 0.0]) * at_rest.frame_t_s[:, None, None]
     assert end(at_rest, creeping, rest=False) < 12.0
+
+
+def test_the_lag_that_was_found_is_taken_off_before_the_gap_is_bridged() -> None:
+    """Left on, 60 ms would be some ten centimetres a metre a second; on the wrong side, twice that."""
+    recording, truth, _ = record(POINT, 9.0, "mems", 5, late_s=-0.06)
+    gap = [Gap(6.5, 2.0)]
+    answer = follow(recording, gap, FollowSettings("ins", GRADES["mems"], extras=Extras()))
+    known = replace(answer.recording, points_W_mm=truth)
+    (end,) = judged(known, answer.path, gap, hidden(known, gap))
+    assert end.end_error_mm < 25.0
+    assert answer.alarms == []
+    assert answer.recording.imu_t_s[0] == pytest.approx(0.06, abs=0.001)
+
+
+def test_a_lag_beyond_what_was_looked_for_is_none_that_was_found() -> None:
+    recording, _, _ = record(POINT, 9.0, "mems", 5, late_s=0.45)
+    assert find_time_offset(recording).late_s == 0.0
+    assert find_time_offset(recording, reach_s=0.6).late_s == pytest.approx(0.45, abs=0.002)
