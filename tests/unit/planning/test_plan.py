@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -229,6 +230,11 @@ def test_swivel_is_counted_from_the_built_attitude() -> None:
     tight = replace(rc1(), swivel_rad=np.radians([15.0, 15.0, 0.3, 15.0]))
     with pytest.raises(BallSwivelExceeded, match="C"):
         make_plan(request((0, 0, 0), (0, 0, 0.4)), tight, SETTINGS)
+    built = Rotation.from_euler("z", 40.0, degrees=True).as_matrix()
+    askew = replace(wide(), neutral_R_WC=built, balls_C_mm=wide().balls_C_mm @ built)
+    make_plan(request((0, 0, 0), (0, 0, 14.9)), askew, SETTINGS)
+    with pytest.raises(BallSwivelExceeded):
+        make_plan(request((0, 0, 0), (0, 0, 15.1)), askew, SETTINGS)
 
 
 def test_reactions_over_the_tolerance_of_the_centre_of_mass() -> None:
