@@ -21,7 +21,7 @@ from docking.guidance.features import Features, extract, grey
 from docking.guidance.frame_error import FrameError
 from docking.guidance.marker_pose import locate_by_markers
 from docking.guidance.opencv import opencv
-from docking.guidance.pose_only import CameraFit, Sights, refine, seen_sigma_mm
+from docking.guidance.pose_only import CameraFit, Sights, focal_misfit, refine, seen_sigma_mm
 from docking.guidance.types import ArMap, Camera, Image, MarkerLayout
 from docking.guidance.vocabulary import Bags, bags_of, train
 from docking.types import Array, Pose
@@ -41,6 +41,8 @@ _ENOUGH = 200
 """So many points tell two poses apart."""
 _ALIKE, _APART = 1.25, 0.02
 """A second pose fits too when its rms is at most so many times the first one's; so many depths away it is another."""
+_FOCUS, _FOCUS_SIGMAS = 0.01, 3.0
+"""The picture may ask for a focal length that is so much another, or so many of its sigmas, and no more."""
 COVERAGE = 2.0
 """Predicted errors are this many sigmas."""
 
@@ -282,8 +284,13 @@ class Localiser:
             raise self._refused(f"points agree only within {fit.rms_px:.1f} px", count, s.least_points)
         p_C = fit.X_WC.inverse().apply(self.ar_map.points_mm[points[inside]])
         depth = float(np.median(p_C[:, 2]))
-        if _second_pose(self.camera, fit, guided.sights(self.ar_map, features, rows, points)):
+        sights = guided.sights(self.ar_map, features, rows, points)
+        if _second_pose(self.camera, fit, sights):
             raise self._refused("two poses fit what is seen, turned about the part in view", count, s.least_points)
+        larger, sigma = focal_misfit(self.camera, fit, sights)
+        if not abs(larger) <= max(_FOCUS, _FOCUS_SIGMAS * sigma):
+            cause = f"the focal length is {100.0 * larger:+.1f} % off its calibration: another camera, zoom or focus?"
+            raise self._refused(cause, count, count)
         generation = float(np.mean(self.index.generation[points[inside]]))
         sigma = max(s.map_sigma_mm, self._frame.rms_mm) * float((1.0 + generation) ** 1.5)
         found = Localised(

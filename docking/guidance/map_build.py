@@ -17,6 +17,7 @@ from docking.guidance.detection import MarkerDetector, MarkerSighting
 from docking.guidance.images import FOLDER_FPS, Picture, pictures
 from docking.guidance.input_files import read_camera, read_layout
 from docking.guidance.map_builder import BuilderSettings, MapBuilder
+from docking.guidance.map_doubts import doubts
 from docking.guidance.map_methods import (
     MethodSettings,
     Placed,
@@ -36,11 +37,6 @@ Method = Literal["published", "joint", "single-aruco"]
 Builder = Literal["own", "colmap", "tum"]
 METHODS: tuple[Method, ...] = ("published", "joint", "single-aruco")
 BUILDERS: tuple[Builder, ...] = ("own", "colmap", "tum")
-_LEAST_SPAN = 0.5
-_DOUBTFUL_RMS_MM = 3.0
-_STRAIN_SIGMAS, _LEAST_STRAIN_MM, _HIDDEN = 3.0, 0.4, 10.0
-"""Circles of a joint map further from the survey than so many sigmas (at least so many mm) strain it; a group that was
-moved by 10 mm leaves 1 mm at its circles."""
 _PLACE = {"published": published, "joint": joint, "single-aruco": single_aruco}
 
 
@@ -152,8 +148,9 @@ def _quality(
 ) -> MapQuality:
     registered, ar_map = placed.registered, placed.ar_map
     rejected = registered.rejected if registered is not None else {}
-    named = tuple(f"marker {marker} is not used: {why}" for marker, why in rejected.items())
+    named = tuple(_named_marker(marker, why, placed) for marker, why in rejected.items())
     rms = marker_rms_mm(ar_map, layout, scanned.sightings, settings.registration)
+    found = doubts(placed, scanned.free.camera, layout, settings, rms)
     return replace(
         quality,
         markers_used=placed.markers_used,
@@ -161,54 +158,18 @@ def _quality(
         reset_keyframes=tuple(ar_map.keyframes[row].name for row in placed.reset),
         scale=placed.scale,
         marker_rms_mm=None if isnan(rms) else rms,
-        doubt_mm=_doubt_mm(placed, layout, quality.method, rms),
+        doubt_mm=max((doubt.mm for doubt in found), default=0.0),
         reprojection_rms_px=reprojection_rms_px(ar_map),
         build_s=scanned.build_s,
-        notices=(*scanned.notices, *named, *placed.notices, *_doubts(placed, layout, quality.method, rms)),
+        notices=(*scanned.notices, *named, *placed.notices, *(doubt.words for doubt in found)),
     )
 
 
-def _doubt_mm(placed: Placed, layout: MarkerLayout, method: str, rms_mm: float) -> float:
-    """How far off the frame may be where markers contradict each other, or the pictures contradict the survey."""
-    if placed.registered is None:
-        return 0.0
-    return max(placed.registered.doubt_mm, _strained_mm(layout, rms_mm) if method == "joint" else 0.0)
-
-
-def _strained_mm(layout: MarkerLayout, rms_mm: float) -> float:
-    """What a joint map may hide: it bends to a wrong survey, and leaves a tenth of the error at the circles."""
-    allowed_mm = max(_LEAST_STRAIN_MM, _STRAIN_SIGMAS * float(np.sqrt(np.mean(np.sum(layout.sigma_mm**2, axis=2)))))
-    return 0.0 if isnan(rms_mm) or rms_mm <= allowed_mm else _HIDDEN * rms_mm
-
-
-def _doubts(placed: Placed, layout: MarkerLayout, method: str, rms_mm: float) -> tuple[str, ...]:
-    """What a person must know before trusting the frame."""
-    if method == "single-aruco":
-        return ()
-    used = [layout.circles_mm[k] for k, marker in enumerate(layout.ids) if marker in placed.markers_used]
-    known = np.concatenate(used) if used else np.zeros((1, 3))
-    cameras = np.array([frame.X_WC.t_mm for frame in placed.ar_map.keyframes])
-    span, size = (float(np.linalg.norm(np.ptp(points, axis=0))) for points in (known, cameras))
-    doubts = []
-    apart_mm, strained_mm = 0.0 if placed.registered is None else placed.registered.doubt_mm, 0.0
-    if method == "joint":
-        strained_mm = _strained_mm(layout, rms_mm)
-    if strained_mm > 0.0:
-        doubts.append(
-            f"the circles lie {rms_mm:.2f} mm rms from their survey, more than its sigmas allow: "
-            "some have moved together, or the survey is worse than it says"
-        )
-    if apart_mm > 0.0:
-        doubts.append(
-            f"markers that agree with each other lie {apart_mm:.0f} mm from where the others put them: moved together, "
-            "or the map is bent (calibration?). Scan again, or take the moved ones out of the survey"
-        )
-    if span < _LEAST_SPAN * size:
-        doubts.append(f"the markers span {span:.0f} mm of a scan of {size:.0f} mm: far from them the frame is a guess")
-    if not (rms_mm <= _DOUBTFUL_RMS_MM):
-        how = "cannot be triangulated" if isnan(rms_mm) else f"lie {rms_mm:.1f} mm rms from their survey"
-        doubts.append(f"the circles {how} in the finished map: do not trust it")
-    return tuple(doubts)
+def _named_marker(marker: int, why: str, placed: Placed) -> str:
+    """A marker that disagrees as a whole is not used at all, one with a wrong circle by its others."""
+    if marker in placed.markers_used:
+        return f"marker {marker} is used only by its other circles, and not to localise by: {why}"
+    return f"marker {marker} is not used: {why}"
 
 
 def map_json(ar_map: ArMap) -> dict[str, Any]:
@@ -233,6 +194,15 @@ def map_json(ar_map: ArMap) -> dict[str, Any]:
     }
 
 
+def _whence(ar_map: ArMap) -> str:
+    """Where the key-frames were taken: all that shows a survey with two columns exchanged, if the markers are flat."""
+    at = np.array([frame.X_WC.t_mm for frame in ar_map.keyframes])
+    return (
+        ", ".join(f"{n} {low:.0f} to {high:.0f}" for n, low, high in zip("xyz", at.min(0), at.max(0), strict=True))
+        + " mm"
+    )
+
+
 def map_text(ar_map: ArMap) -> str:
     """The same for a person."""
     quality, rms = ar_map.quality, ar_map.quality.marker_rms_mm
@@ -242,6 +212,7 @@ def map_text(ar_map: ArMap) -> str:
         f"circles against their survey: {'not seen' if rms is None else f'{rms:.2f} mm rms'}",
         f"reprojection {quality.reprojection_rms_px:.2f} px rms; scan {quality.build_s:.1f} s, "
         f"optimisation {quality.optimise_s:.2f} s",
+        f"scanned from {_whence(ar_map)} of the cell: was the camera there?",
     ]
     if quality.method == "published":
         lines.insert(2, f"key-frames reset from circles: {', '.join(quality.reset_keyframes) or 'none'}")

@@ -50,6 +50,7 @@ CAMERA_SIGMA = (0.003, 3.0, 3.0, 0.01, 0.01)
 class Placed:
     """A map in the cell and what was found out on the way: `scale` mm for one unit of the free map."""
 
+    method: str
     ar_map: ArMap
     registered: Registered | None
     scale: float
@@ -58,10 +59,10 @@ class Placed:
     notices: tuple[str, ...] = ()
 
 
-def _placed(
+def _as_published(
     ar_map: ArMap, registered: Registered, reset: tuple[int, ...] = (), notices: tuple[str, ...] = ()
 ) -> Placed:
-    return Placed(ar_map, registered, registered.similarity.scale, registered.markers, reset, notices)
+    return Placed("published", ar_map, registered, registered.similarity.scale, registered.markers, reset, notices)
 
 
 @dataclass(frozen=True)
@@ -96,12 +97,12 @@ def published(free: ArMap, layout: MarkerLayout, sightings: Sightings, settings:
     reset = _reset_poses(placed, layout, used, rules)
     if not reset:
         notice = "no key-frame qualifies for a reset (two markers, a quarter of the image): similarity only"
-        return _placed(placed, registered, (), (notice,))
+        return _as_published(placed, registered, (), (notice,))
     frames = tuple(replace(f, X_WC=reset.get(i, f.X_WC)) for i, f in enumerate(placed.keyframes))
     again = _retriangulated(replace(placed, keyframes=frames), sorted(reset))
     few = f"only {len(reset)} key-frames qualify for a reset: away from them the map stays as it drifted"
     notices = (few,) if len(reset) < _FEW_RESETS else ()
-    return _placed(_adjusted(again, sorted(reset), settings), registered, tuple(sorted(reset)), notices)
+    return _as_published(_adjusted(again, sorted(reset), settings), registered, tuple(sorted(reset)), notices)
 
 
 def joint(free: ArMap, layout: MarkerLayout, sightings: Sightings, settings: MethodSettings) -> Placed:
@@ -112,7 +113,8 @@ def joint(free: ArMap, layout: MarkerLayout, sightings: Sightings, settings: Met
     placed = in_cell(free, registered.similarity)
     bundle = _bundle(placed, np.zeros(len(placed.keyframes), bool))
     bundle = _with_circles(bundle, layout, passed, registered, settings)
-    return _placed(_moved(placed, bundle, settings), registered)
+    moved = _moved(placed, bundle, settings)
+    return Placed("joint", moved, registered, registered.similarity.scale, registered.markers)
 
 
 def single_aruco(free: ArMap, layout: MarkerLayout, sightings: Sightings, settings: MethodSettings) -> Placed:
@@ -138,7 +140,7 @@ def single_aruco(free: ArMap, layout: MarkerLayout, sightings: Sightings, settin
     R = X_WC.R @ camera.R.T
     similarity = Similarity(scale, R, X_WC.t_mm - scale * R @ camera.t_mm)
     notice = f"frame and scale from marker {marker} alone, first seen in {free.keyframes[row].name}"
-    return Placed(in_cell(free, similarity), None, scale, (marker,), (), (notice,))
+    return Placed("single-aruco", in_cell(free, similarity), None, scale, (marker,), (), (notice,))
 
 
 def _corner_pose(sighting: MarkerSighting, layout: MarkerLayout, free: ArMap) -> Pose | None:

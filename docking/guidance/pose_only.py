@@ -141,6 +141,28 @@ def _fitted(camera: Camera, X_WC: Pose, sights: Sights) -> CameraFit:
     return CameraFit(X_WC, clustered + inverse, inside, rms_px)
 
 
+def focal_misfit(camera: Camera, fit: CameraFit, sights: Sights) -> tuple[float, float]:
+    """(change of log f that the sights ask for, its sigma): one step of pose and focal length together from `fit`.
+
+    Its sigma by the same clusters as the pose's; large where what is seen is flat and faces the camera.
+    """
+    chosen = sights.where(fit.inside)
+    error, p_C = residuals(camera, fit.X_WC, chosen)
+    weight = _weights(error, chosen.sigma_px)
+    larger = camera.project(p_C) - (camera.cx_px, camera.cy_px)
+    J = np.concatenate([jacobian(camera, p_C), larger[:, :, None]], axis=2)
+    try:
+        inverse = np.linalg.inv(np.einsum("nij,nik,n->jk", J, J, weight))
+    except np.linalg.LinAlgError:
+        return 0.0, float("inf")
+    step = inverse @ np.einsum("nij,ni,n->j", J, error, weight)
+    left = np.einsum("nij,ni,n->nj", J, error - J @ step, weight)
+    sums = np.zeros((_BLOCKS * _BLOCKS, 7))
+    np.add.at(sums, _block(camera, chosen.pixels), left)
+    variance = (inverse @ (sums.T @ sums) @ inverse + inverse)[6, 6]
+    return float(step[6]), float(np.sqrt(variance))
+
+
 def _block(camera: Camera, pixels: Array) -> NDArray[np.intp]:
     share = np.clip(pixels / (camera.width_px, camera.height_px), 0.0, 0.999)
     column, row = (share * _BLOCKS).astype(np.intp).T

@@ -57,6 +57,14 @@ def test_a_hint_finds_the_same_place(localiser: Localiser) -> None:
     assert np.linalg.norm(localiser.localise(picture(HERE), wrong).X_WC.t_mm - HERE.t_mm) < 4.0
 
 
+@pytest.mark.parametrize("share", [0.94, 1.06])
+def test_a_picture_of_another_zoom_is_refused_with_its_name(localiser: Localiser, share: float) -> None:
+    """Its points fit a place 6 % further away or nearer nearly as well, and say 2 mm of a pose that is 50 mm off."""
+    zoomed = replace(CAMERA, fx_px=share * CAMERA.fx_px, fy_px=share * CAMERA.fy_px)
+    with pytest.raises(NotLocalised, match="focal length"):
+        Localiser(localiser.index, zoomed, MAP_ONLY).localise(picture(HERE))
+
+
 def other_place() -> Image:
     """Another wall of the same make, with the same markers."""
     patches = wall_scenery(33, WallSize(1600.0, 1000.0, boxes=6, groups=2), X_WP).patches

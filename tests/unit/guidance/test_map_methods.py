@@ -193,6 +193,40 @@ def test_a_prior_of_the_survey_is_used_as_stated(wall: Wall) -> None:
     assert loose < 0.5 * firm
 
 
+def test_a_calibration_that_the_pictures_contradict_is_told_and_nothing_is_promised(wall: Wall) -> None:
+    camera = wall.free.camera
+    zoomed = replace(camera, fx_px=1.06 * camera.fx_px, fy_px=1.06 * camera.fy_px)
+    scanned = Scanned(replace(wall.free, camera=zoomed), wall.sightings, 1.0)
+    quality = place(scanned, wall.layout, "joint", MethodSettings()).quality
+    assert any("contradict the calibration" in notice for notice in quality.notices)
+    assert 2.0 * quality.doubt_mm > 10.0
+    right = _placed(wall, "joint").quality
+    assert right.doubt_mm == 0.0
+    assert not any("calibration" in notice for notice in right.notices)
+
+
+def test_a_marker_moved_by_less_than_drift_casts_a_doubt_on_the_published_map(wall: Wall) -> None:
+    """8 mm pass for drift, so the marker stays in and the map leans to it: its circles tell that something is wrong."""
+
+    def moved(circles: Array) -> None:
+        circles[1] += [0.0, 8.0, 0.0]
+
+    placed = _placed(wall, "published", _changed(wall, moved))
+    assert not placed.quality.markers_rejected
+    assert 10.0 < ate_mm(placed, wall.truth) < placed.quality.doubt_mm
+    assert any("more than its sigmas allow" in notice for notice in placed.quality.notices)
+    assert _placed(wall, "published").quality.doubt_mm == 0.0
+
+
+def test_a_circle_left_out_is_not_its_whole_marker(wall: Wall) -> None:
+    def typed(circles: Array) -> None:
+        circles[2, 1, 0] += 100.0
+
+    quality = _placed(wall, "joint", _changed(wall, typed)).quality
+    assert 2 in quality.markers_used
+    assert any(notice.startswith("marker 2 is used only by its other circles") for notice in quality.notices)
+
+
 def test_points_on_a_line_and_the_largest_set_that_agrees() -> None:
     rng = np.random.default_rng(3)
     known = rng.normal(0.0, 500.0, (12, 3))

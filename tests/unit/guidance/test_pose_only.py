@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from docking.geometry import log_so3
-from docking.guidance.pose_only import Sights, jacobian, perturbed, refine, residuals, seen_sigma_mm
+from docking.guidance.pose_only import Sights, focal_misfit, jacobian, perturbed, refine, residuals, seen_sigma_mm
 from docking.guidance.types import Camera
 from docking.types import Array, Pose
 from sim.scenery import looking
@@ -86,3 +88,25 @@ def test_start_on_the_answer_stays() -> None:
     fit = refine(CAMERA, X_WC, seen(100, np.random.default_rng(5), 0.0))
     assert np.allclose(fit.X_WC.t_mm, X_WC.t_mm, atol=1e-6)
     assert isinstance(fit.X_WC, Pose)
+
+
+def test_points_at_several_depths_tell_a_wrong_focal_length() -> None:
+    rng = np.random.default_rng(6)
+    for share in (1.0, 0.97, 1.04):
+        sights = seen(400, rng, 0.5)
+        told = replace(CAMERA, fx_px=CAMERA.fx_px * share, fy_px=CAMERA.fy_px * share)
+        larger, sigma = focal_misfit(told, refine(told, X_WC, sights), sights)
+        assert sigma < 0.006
+        assert larger == pytest.approx(-np.log(share), abs=4.0 * sigma)
+        assert (abs(larger) > 3.0 * sigma) == (share != 1.0)
+
+
+def test_a_flat_wall_straight_ahead_says_nothing_about_the_focal_length() -> None:
+    rng = np.random.default_rng(7)
+    at = np.column_stack([rng.uniform(-300.0, 300.0, (300, 2)), np.full(300, 900.0)])
+    X = Pose(np.eye(3), np.zeros(3))
+    sights = Sights(at, CAMERA.project(at) + rng.normal(0.0, 0.5, (300, 2)), np.full(300, 0.5))
+    told = replace(CAMERA, fx_px=1.05 * CAMERA.fx_px, fy_px=1.05 * CAMERA.fy_px)
+    larger, sigma = focal_misfit(told, refine(told, X, sights), sights)
+    assert abs(larger) < 3.0 * sigma
+    assert sigma > 0.02
