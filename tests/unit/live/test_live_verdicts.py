@@ -151,7 +151,9 @@ def test_a_stated_delay_of_the_camera_is_taken_off(settings: LiveSettings) -> No
 
 def test_swapped_tools_are_told_and_neither_stop_the_move_nor_bend_the_pose(settings: LiveSettings) -> None:
     def change(k: int, seen: dict[str, Array]) -> None:
-        if 40 <= k < 60:
+        if 40 <= k < 60:  # of four points the two swapped ones outvote nobody, but are not outvoted either
+            for name in [name for name in seen if name not in ("nose", "tail")][2:]:
+                del seen[name]
             seen["nose"], seen["tail"] = seen["tail"], seen["nose"]
 
     bench = Bench(settings, change)
