@@ -22,6 +22,8 @@ from drivers.modbus_wires import units_of
 from drivers.register_map import RegisterMap, load_map
 
 ROUND_TRIPS = 10
+LISTEN_S = 0.3
+"""How long it takes at least to see a host that is alive."""
 PHASE_S = 0.5
 """How long the scan counters are watched to find when the controllers scan."""
 
@@ -114,6 +116,22 @@ class ModbusLook:
         taken = tuple(station.watch.taken_s)
         beat = f"polled every {1e3 * module.poll_s:.0f} ms"
         return Found(station.where, station.address, identity, "", units, beat, taken, problem)
+
+    async def controlled(self) -> bool:
+        """True where a host keeps a PLC alive: the heartbeat that it repeats changes."""
+        if self._bus is None:
+            return False
+        stations = [station for station in self._plcs.values() if station.unit.connected]
+        before = [await self._host_beat(station) for station in stations]
+        await asyncio.sleep(LISTEN_S + 2.0 * self._bus.poll_s)
+        after = [await self._host_beat(station) for station in stations]
+        return any(b is not None and a is not None and b != a for b, a in zip(before, after, strict=True))
+
+    async def _host_beat(self, station: _Station) -> int | None:
+        try:
+            return int((await self._read(station, "status"))["hb_echo"])
+        except DockingError:
+            return None
 
     async def start_skew_s(self) -> tuple[float, float] | None:
         """Largest difference of the instants at which the controllers scan, and how well it is known; None where it

@@ -26,6 +26,8 @@ from drivers.modbus_look import ModbusLook
 from drivers.modbus_positioners import ModbusPositioners
 
 STRANGER = "not in the cell"
+SYNC, HOST = "SYNC", "heartbeat of a host"
+"""By which another controller is known."""
 PROVE_S = 1.0
 """How long the read-backs of a bus are timed."""
 
@@ -73,11 +75,13 @@ def find_devices(request: LookRequest, proving: Proving = LOOKING) -> dict[str, 
             look = ModbusLook(cell, ends.bus.modbus, ends.tap, ends.bus.line)
             try:
                 rows += await look.find()
+                if await look.controlled():
+                    rows.append(Found(STRANGER, HOST, state="another controller runs these positioners"))
                 skew = await look.start_skew_s()
             finally:
                 look.close()
             rows += await look_at_singles(cell, ends)
-            alone = not any(found.where == STRANGER and found.address == "SYNC" for found in rows)
+            alone = not any(found.where == STRANGER and found.address in (SYNC, HOST) for found in rows)
             proof = _UNPROVED
             if proving.wanted:
                 proof = await _prove(cell, ends, proving) if alone else _Proof(_occupied())
@@ -99,7 +103,7 @@ _UNPROVED = _Proof()
 
 
 def _occupied() -> DockingError:
-    return LinkLost("bus", "Another controller runs it: nothing was written.")
+    return LinkLost("bus", "Another controller runs the positioners: nothing was written.")
 
 
 async def _tracker(cell: CellFile, ends: Ends) -> Found:
@@ -139,7 +143,7 @@ async def _bus(cell: CellFile, link: CanLink) -> tuple[Found, ...]:
     finally:
         look.close()
     if look.controlled:
-        found = (*found, Found(STRANGER, "SYNC", state="another controller runs this bus"))
+        found = (*found, Found(STRANGER, SYNC, state="another controller runs this bus"))
     return found
 
 

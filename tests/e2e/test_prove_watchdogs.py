@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
+import socket
+import struct
 import threading
 
 import pytest
 
 from docking.cli import call
+from docking.transcript import read_transcript
 from drivers.links.can_bus import CanBusLink
 from tests.support.dry_cell import CELLS
 from tests.support.program import served
@@ -27,6 +31,39 @@ def test_every_drive_misses_the_heartbeat_and_says_when(capsys):
 def test_plcs_have_no_such_proof(capsys):
     assert call(["devices", str(CELLS / "lab-modbus.toml"), "--sim", "--prove-watchdogs"]) == 2
     assert "CANopen" in capsys.readouterr().err
+
+
+def test_plcs_with_another_host_are_left_alone(capsys, tmp_path):
+    """To bring them up means to disable them: what they carry would be stopped in the middle of a move."""
+    cell = CELLS / "lab-modbus.toml"
+    over = threading.Event()
+
+    def host(address: tuple[str, int]) -> None:
+        """Keeps positioner C alive by its heartbeat register 0Fh."""
+        with socket.create_connection(address) as line:
+            for beat in itertools.count(1):
+                line.sendall(struct.pack(">HHHBBHHBH", beat & 0xFFFF, 0, 9, 1, 16, 0x0F, 1, 2, beat & 0xFFFF))
+                line.recv(64)
+                if over.wait(0.05):
+                    return
+
+    with served(cell, tmp_path) as wires:
+        address = tuple(json.loads(wires.read_text())["modbus"]["C"])
+        thread = threading.Thread(target=host, args=(address,))
+        thread.start()
+        transcript = tmp_path / "bytes.txt"
+        there = ["--sim", "--wires", str(wires), "--json", "--transcript", str(transcript)]
+        try:
+            assert call(["devices", str(cell), *there, "--prove"]) == 1
+        finally:
+            over.set()
+            thread.join()
+    report = json.loads(capsys.readouterr().out)
+    assert report["bring_up"]["code"] == 1006
+    assert "another controller" in report["bring_up"]["message"].lower()
+    assert [row["address"] for row in report["devices"] if row["stray"]] == ["heartbeat of a host"]
+    functions = {line.data[7] for line in read_transcript(transcript) if line.wire.startswith("modbus:") and line.sent}
+    assert functions <= {2, 3, 4}, "only reads"
 
 
 def test_a_bus_with_another_controller_is_left_alone(capsys, tmp_path):
