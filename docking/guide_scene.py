@@ -198,6 +198,7 @@ class _Builder:
             # The arrow points where the feature must go: against its deviation.
             vector = -np.array(error)
             self._marks.append(Mark(X_WC.apply(places[name]), words, tone, vector, magnified, "feature"))
+        self._head.append((self._texts["feature_arrows"].format(magnified=magnified), "dim"))
 
     def _next_move(self, X_WC: Pose, fit: Record) -> None:
         record = self._source.last("plan")

@@ -50,31 +50,52 @@ def is_chinese(text: str) -> bool:
     return any("\u2e80" <= character <= "\u9fff" or "\uff00" <= character <= "\uffef" for character in text)
 
 
+Box = tuple[float, float, float, float]
+"""Left, top, right, bottom px."""
+_PLACES = (0, 1, -1, 2, -2, 3, -3)
+
+
+def _free(box: Box, taken: list[Box], line_px: int) -> float:
+    """How far down (px, whole lines) a box covers no other; 0 where there is no such place near by."""
+    for lines in _PLACES:
+        top, bottom = box[1] + lines * line_px, box[3] + lines * line_px
+        if not any(box[0] < b[2] and b[0] < box[2] and top < b[3] and b[1] < bottom for b in taken):
+            return float(lines * line_px)
+    return 0.0
+
+
 class Letters:
     """Collects words and puts them all into a picture at once: converting the picture costs more than the words."""
 
     def __init__(self, size_px: int) -> None:
         self.size_px = size_px
         self._words: list[tuple[float, float, str, Colour]] = []
+        self._fixed: list[tuple[float, float, str, Colour]] = []
 
-    def put(self, x: float, y: float, text: str, colour: Colour) -> None:
-        """Words with their top left at (x, y) px."""
+    def put(self, x: float, y: float, text: str, colour: Colour, *, fixed: bool = False) -> None:
+        """Words with their top left at (x, y) px; those that are not fixed give way to others, by whole lines."""
         if text:
-            self._words.append((x, y, text, colour))
+            (self._fixed if fixed else self._words).append((x, y, text, colour))
 
     def drawn(self, image: Image) -> Image:
         """The picture (h, w, 3) with the words on a dark ground. Raises FontMissing, ExtraMissing."""
-        if not self._words:
+        words = [*self._fixed, *self._words]
+        if not words:
             return image
-        face = font(self.size_px, chinese=any(is_chinese(text) for _, _, text, _ in self._words))
+        face = font(self.size_px, chinese=any(is_chinese(text) for _, _, text, _ in words))
         from PIL import Image as PillowImage
         from PIL import ImageDraw
 
         picture = PillowImage.fromarray(image[:, :, ::-1].copy())
         canvas = ImageDraw.Draw(picture, "RGBA")
-        for x, y, text, (blue, green, red) in self._words:
+        taken: list[Box] = []
+        for k, (x, y, text, (blue, green, red)) in enumerate(words):
             left, top, right, bottom = canvas.textbbox((x, y), text, font=face)
-            canvas.rectangle((left - 3, top - 2, right + 3, bottom + 2), fill=(0, 0, 0, 150))
-            canvas.text((x, y), text, font=face, fill=(red, green, blue, 255))
+            box = (left - 3, top - 2, right + 3, bottom + 2)
+            down = 0.0 if k < len(self._fixed) else _free(box, taken, self.size_px + 8)
+            box = (box[0], box[1] + down, box[2], box[3] + down)
+            taken.append(box)
+            canvas.rectangle(box, fill=(0, 0, 0, 150))
+            canvas.text((x, y + down), text, font=face, fill=(red, green, blue, 255))
         result: Image = np.ascontiguousarray(np.asarray(picture)[:, :, ::-1])
         return result

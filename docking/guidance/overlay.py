@@ -10,6 +10,7 @@ from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from docking.errors import NotLocalised, OverlayUncertain
 from docking.guidance.lettering import Colour, Letters
@@ -29,7 +30,8 @@ COLOURS: Final[dict[Tone, Colour]] = {
 }
 """Okabe-Ito-like tones, apart in brightness too; words say the same for those who do not see the colours."""
 _NEAREST_MM = 20.0
-_STEPS_PER_LINE = 24
+_STEPS_PER_LINE, _JUDGED = 24, 4
+"""Lines are drawn in so many pieces, and judged at the end of every fourth."""
 _AXIS_MM = 60.0
 
 
@@ -91,20 +93,32 @@ class _Picture:
         size = self._image.shape[1]
         return np.where(np.abs(pixels) < 20 * size, pixels, np.nan)
 
-    def _certain(self, at_W_mm: Array) -> bool:
-        """Whether a thing may be drawn there; counts those that may not."""
-        if not self._X_CW.apply(at_W_mm)[2] > _NEAREST_MM:
+    def _in_picture(self, points_W_mm: Array) -> NDArray[np.bool_]:
+        """Which points (n, 3) the picture shows."""
+        pixels = self._pixels(points_W_mm)
+        inside: NDArray[np.bool_] = np.all((pixels >= 0.0) & (pixels < self._image.shape[1::-1]), axis=1)
+        return inside
+
+    def _certain(self, *places_W_mm: Array) -> bool:
+        """Whether a thing that reaches to these places may be drawn; counts those that may not."""
+        if not all(self._X_CW.apply(place)[2] > _NEAREST_MM for place in places_W_mm):
             return False
-        good = self._found.predicted_error_mm(at_W_mm) <= self._limit_mm
+        good = all(self._found.predicted_error_mm(place) <= self._limit_mm for place in places_W_mm)
         self._left_out += int(not good)
-        return bool(good)
+        return good
 
     def line(self, line: Line) -> None:
-        if not self._certain(line.points_mm.mean(axis=0)):
-            return
+        """The pieces of a line that are certain enough: the far end of a long one may not be."""
         share = np.linspace(0.0, 1.0, _STEPS_PER_LINE, endpoint=False)[:, None]
-        fine = [a + share * (b - a) for a, b in pairwise(line.points_mm)]
-        self._stroke(np.concatenate([*fine, line.points_mm[-1:]]), line.tone, 2)
+        fine = np.concatenate([*(a + share * (b - a) for a, b in pairwise(line.points_mm)), line.points_mm[-1:]])
+        if not np.any(self._in_picture(fine)):
+            return
+        ends = fine[::_JUDGED]
+        good = [self._found.predicted_error_mm(end) <= self._limit_mm for end in ends]
+        for k, both in enumerate(pairwise(good)):
+            if all(both):
+                self._stroke(fine[k * _JUDGED : (k + 1) * _JUDGED + 1], line.tone, 2)
+        self._left_out += int(not all(good))
 
     def _stroke(self, points_W_mm: Array, tone: Tone, width: int) -> None:
         pixels = self._pixels(points_W_mm)
@@ -113,17 +127,21 @@ class _Picture:
                 opencv().line(self._image, _at(a), _at(b), COLOURS[tone], width, opencv().LINE_AA)
 
     def part(self, part: PartToPlace) -> None:
-        """The edges of a part at its place, or its axes."""
+        """The edges of a part at its place, or its axes; where it reaches too far for that, only what it is."""
         if not self._certain(part.X_WP.t_mm):
             return
-        if part.mesh is None:
-            for axis in np.eye(3) * _AXIS_MM:
-                self._stroke(part.X_WP.apply(np.array([np.zeros(3), axis])), part.tone, 2)
-        else:
-            self._faces(part)
+        if self._certain(*part.X_WP.apply(_reach_mm(part))):
+            self._shape(part)
         where = self._pixels(part.X_WP.t_mm[None])[0]
         if part.words and np.all(np.isfinite(where)):
             self._letters.put(where[0] + 10, where[1] + 10, part.words, COLOURS[part.tone])
+
+    def _shape(self, part: PartToPlace) -> None:
+        if part.mesh is not None:
+            self._faces(part)
+            return
+        for axis in np.eye(3) * _AXIS_MM:
+            self._stroke(part.X_WP.apply(np.array([np.zeros(3), axis])), part.tone, 2)
 
     def _faces(self, part: PartToPlace) -> None:
         """Faces as a veil, sharp edges as lines."""
@@ -170,13 +188,21 @@ class _Picture:
         if self._left_out:
             rows.append((scene.captions["left_out"].format(count=self._left_out, limit_mm=self._limit_mm), "close"))
         for k, (text, tone) in enumerate(rows):
-            self._letters.put(8, 8 + k * line, text, COLOURS[tone])
+            self._letters.put(8, 8 + k * line, text, COLOURS[tone], fixed=True)
         foot = self._image.shape[0] - 8 - len(scene.steps) * line
         for k, (text, tone) in enumerate(scene.steps):
-            self._letters.put(8, foot + k * line, text, COLOURS[tone])
+            self._letters.put(8, foot + k * line, text, COLOURS[tone], fixed=True)
 
     def finished(self) -> Image:
         return self._letters.drawn(self._image)
+
+
+def _reach_mm(part: PartToPlace) -> Array:
+    """How far a part reaches in its own frame: the corners (8, 3) of its box, or the tips (3, 3) of its axes."""
+    if part.mesh is None:
+        return np.eye(3) * _AXIS_MM
+    both = np.array([part.mesh.points_mm.min(axis=0), part.mesh.points_mm.max(axis=0)])
+    return np.array([[both[i, 0], both[j, 1], both[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
 
 
 def _at(pixel: Array) -> tuple[int, int]:

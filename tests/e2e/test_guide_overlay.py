@@ -148,6 +148,7 @@ def test_deviations_point_home_and_arrows_are_those_of_the_plan(bench: Bench) ->
     scene = build_scene(source, "en")
     features = [m for m in scene.marks if m.kind == "feature"]
     assert len(features) == 4
+    assert f"Arrows of features are {features[0].magnified:g} times their length" in [text for text, _ in scene.head]
     assert all(m.tone == "bad" and "OUT OF" in m.words for m in features)
     fit, goal = source.last("fit", what="component"), source.last("goal")
     assert fit is not None

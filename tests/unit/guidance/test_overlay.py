@@ -12,6 +12,7 @@ from docking.errors import FontMissing, OverlayUncertain
 from docking.guidance import lettering
 from docking.guidance.lettering import Letters
 from docking.guidance.localiser import Localised
+from docking.guidance.mesh import Mesh
 from docking.guidance.overlay import COLOURS, draw
 from docking.guidance.scene import Line, Mark, PartToPlace, Scene
 from docking.guide_scene import overlay_texts
@@ -88,6 +89,51 @@ def test_what_is_too_far_away_alone_is_left_out_and_counted() -> None:
     image = draw(GREY, replace(found(), cov=cov), scene(marks=(Mark(far, "", "bad"),)), 10.0)
     assert len(drawn_at(image, "bad")) == 0
     assert len(drawn_at(image, "close")) > 20  # the words that say so
+
+
+def swinging() -> Localised:
+    """Sure in the middle of the picture at 800 mm (0.7 mm), 10 mm off 1600 mm further away."""
+    return replace(found(), cov=np.diag([4e-6, 4e-6, 4e-6, 0.1, 0.1, 0.1]))
+
+
+def test_the_far_end_of_a_line_is_left_out_where_it_is_too_uncertain() -> None:
+    near, far = np.array([0.0, 0.0, 600.0]), np.array([500.0, 0.0, 4600.0])
+    image = draw(GREY, swinging(), scene(lines=(Line(X_WC.apply(np.array([near, far])), "good"),)), 10.0)
+    drawn = drawn_at(image, "good")
+    assert len(drawn) > 20
+    depths = [600.0 + share * 4000.0 for share in np.linspace(0.0, 1.0, 400)]
+    sure = [
+        z for z in depths if swinging().predicted_error_mm(X_WC.apply(near + (z - 600.0) / 4000.0 * (far - near))) <= 10
+    ]
+    last = CAMERA.project(near + (max(sure) - 600.0) / 4000.0 * (far - near))
+    assert drawn[:, 0].max() <= last[0] + 2.0
+    assert len(drawn_at(image, "close")) > 20  # and that something was left out is said
+
+
+def test_a_part_that_reaches_into_what_is_uncertain_is_named_and_not_drawn() -> None:
+    points = np.array([[0.0, 0.0, 0.0], [80.0, 0.0, 0.0], [0.0, 80.0, 0.0], [0.0, 0.0, 4000.0]])
+    triangles = np.array([[0, 1, 2], [0, 1, 3]])
+    at = X_WC @ Pose(np.eye(3), np.array([0.0, 0.0, 700.0]))
+    for reach, there in ((1.0, False), (0.01, True)):
+        mesh = Mesh(points * (1.0, 1.0, reach), triangles)
+        image = draw(GREY, swinging(), scene(parts=(PartToPlace("p", at, mesh, "next", ""),)), 10.0)
+        named = draw(GREY, swinging(), scene(parts=(PartToPlace("p", at, mesh, "next", "bracket"),)), 10.0)
+        assert (len(drawn_at(image, "next")) > 20) == there
+        assert np.any(image != named)
+
+
+def test_words_do_not_cover_each_other_and_those_in_the_margin_stay() -> None:
+    black, colours = np.zeros((200, 300, 3), np.uint8), ((0, 0, 255), (0, 255, 0), (255, 0, 0))
+    together = Letters(16)
+    for k, colour in enumerate(colours):
+        together.put(60.0 + 4.0 * k, 80.0 + 3.0 * k, "WWWWWWWW", colour, fixed=colour == colours[-1])
+    image = together.drawn(black).astype(float)
+    for k, colour in enumerate(colours):
+        single = Letters(16)
+        single.put(60.0 + 4.0 * k, 80.0 + 3.0 * k, "WWWWWWWW", colour)
+        alone = single.drawn(black).astype(float)[:, :, 2 - k]
+        assert image[:, :, 2 - k].sum() == pytest.approx(alone.sum(), rel=1e-6)
+        assert np.array_equal(image[:, :, 2 - k], alone) == (k == 2)
 
 
 def test_a_part_without_a_mesh_shows_its_axes() -> None:
