@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 from docking.errors import ApproachRefused, MateTooNear
 from docking.planning import MateSettings, PlanRequest, Scene, correction_to, make_plan, outline_edges
 from docking.planning.clearance import nearest
+from docking.planning.mate import check_mate
+from docking.planning.time_law import quintic
 from docking.types import Array, Plan, Pose
 from tests.reference_geometry import FACE, GUARDED, rc1
 
@@ -166,3 +168,16 @@ def test_a_part_that_stands_too_near_may_only_go_away() -> None:
     plan(near, standing(60.0), free, standoff_mm=60.0)
     with pytest.raises(MateTooNear):
         plan(near, standing(29.0, turn_z_deg=0.8), free, standoff_mm=29.0)
+
+
+@pytest.mark.parametrize(("coast_s", "quick_stop_s"), [(0.5, 0.0), (0.3, 0.4), (0.1, 0.8)])
+def test_coasting_goes_on_for_its_time_and_half_the_ramp(coast_s: float, quick_stop_s: float) -> None:
+    """gap(t) - v(t) (coast + ramp / 2) where it is least, on the way from 100 to 30 mm in 10 s."""
+    law = quintic(10.0)
+    scene = Scene(standing(100.0), MATE, DOCKED, 30.0, 100.0)
+    correction = correction_to(standing(100.0), standing(30.0), FACE)
+    found = check_mate(scene, correction, law, replace(SETTINGS, coast_s=coast_s), quick_stop_s)
+    t_s = np.linspace(0.0, 10.0, 20001)
+    gap = 100.0 - 70.0 * law.at(t_s)
+    assert found.distance_mm == pytest.approx((gap + np.gradient(gap, t_s) * 0.5).min(), abs=0.02)
+    assert found.distance_mm < 29.9
