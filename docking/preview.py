@@ -145,14 +145,14 @@ def _drawn(cell: CellFile, seed: int) -> Array:
     return np.concatenate([shift, TURN_SHARE * limits.first_correction_deg * rng.uniform(-1.0, 1.0, 3)])
 
 
-def curves(move: StageMove) -> tuple[Array, tuple[Array, Array, Array, Array]]:
-    """Along s (n,): displacement, speed, acceleration of every axis, and the force if it jammed there; each (n, m)."""
+def curves(move: StageMove) -> tuple[Array, tuple[Array, ...]]:
+    """Along s (n,): displacement, speed, acceleration of every axis, force and warp if it jammed there; each (n, m)."""
     plan = move.plan
     speed = np.gradient(plan.q_mm, plan.period_s, axis=0)
     rows = np.unique(np.linspace(0, len(plan.s) - 1, min(len(plan.s), DRAWN_ROWS)).round().astype(int))
-    jammed = np.array([move.jam.jam_n(np.abs(speed[row])) for row in rows])
+    jammed = [np.array([cost(np.abs(speed[row])) for row in rows]) for cost in (move.jam.jam_n, move.jam.jam_warp_n)]
     acceleration = np.gradient(speed, plan.period_s, axis=0)
-    return plan.s[rows], (plan.q_mm[rows] - plan.q_mm[0], speed[rows], acceleration[rows], jammed)
+    return plan.s[rows], (plan.q_mm[rows] - plan.q_mm[0], speed[rows], acceleration[rows], *jammed)
 
 
 def preview_json(preview: Preview, moves: list[StageMove]) -> dict[str, Any]:

@@ -7,6 +7,8 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from docking.errors import FileUnwritable
 from docking.preview import StageMove, curves
 from docking.report.figures import COLOURS, DASHES, LIMIT, panels, style, svg
@@ -24,7 +26,7 @@ svg{{width:100%;height:auto}}pre{{overflow-x:auto;font-size:12px}}h2{{margin-top
 """
 
 
-LABELS = ("position / mm", "speed / mm/s", "acceleration / mm/s²", "jammed: force / N")
+LABELS = ("position / mm", "speed / mm/s", "acceleration / mm/s²", "jammed: force / N", "jammed: warp / N")
 
 
 def write_plan_page(title: str, head: str, moves: Sequence[tuple[StageMove, str]], path: Path) -> None:
@@ -50,7 +52,9 @@ def _drawing(move: StageMove, number: int) -> str:
             panel.plot(s, values[:, k], label=axis, **_line(axes, k))
         panel.set_ylabel(label)
         panel.set_xlim(0.0, 1.0)
-    _limit(drawn[-1], move.jam.settings.force_n)
+    jam = move.jam.settings
+    _limit(drawn[-2], jam.force_n)
+    _limit(drawn[-1], jam.warp_n, *([jam.held_warp_n] if np.isfinite(move.jam.tolerance_mm).any() else []))
     drawn[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.02), ncols=6, borderaxespad=0.0)
     drawn[-1].set_xlabel("s")
     return svg(figure, f"plan{number}")
@@ -63,6 +67,8 @@ def _line(axes: tuple[str, ...], k: int) -> dict[str, Any]:
     return {"color": COLOURS[owners.index(owner) % len(COLOURS)], "linestyle": DASHES["XYZ".index(letter)]}
 
 
-def _limit(panel: Axes, limit_n: float) -> None:
-    panel.axhline(limit_n, color=LIMIT, linewidth=1.0, linestyle=(0, (4, 2)))
-    panel.set_ylim(0.0, 1.1 * limit_n)
+def _limit(panel: Axes, *limits_n: float) -> None:
+    """Where the limit is; a second one is that of axes that hold a force."""
+    for limit_n in limits_n:
+        panel.axhline(limit_n, color=LIMIT, linewidth=1.0, linestyle=(0, (4, 2)))
+    panel.set_ylim(0.0, 1.1 * max(limits_n))

@@ -64,7 +64,14 @@ def test_a_person_gets_tables_and_a_page(capsys: pytest.CaptureFixture[str], tmp
     assert out.count("A.X ") == 3
     html = page.read_text("utf-8")
     assert html.count("<svg") == 3
-    for label in ("position / mm", "speed / mm/s", "acceleration / mm/s²", "jammed: force / N", ">A.X<"):
+    for label in (
+        "position / mm",
+        "speed / mm/s",
+        "acceleration / mm/s²",
+        "jammed: force / N",
+        "jammed: warp / N",
+        ">A.X<",
+    ):
         assert label in html
     assert not re.search(r"(src|href)=\"(?!#)", html)
     assert "http" not in html
