@@ -272,7 +272,9 @@ def steps(journal: Path, job: Path | None, done: str | None, undo: str | None, b
         rows = [{"step": s.name, "order": s.order, "state": state, "tool": s.tool} for s, state in states]
         print_json({"steps": [{**row, "text": s.text(language())} for row, (s, _) in zip(rows, states, strict=True)]})
     else:
-        print_text("\n".join(f"{state:5} {s.order} {s.name}: {s.text(language())} [{s.tool}]" for s, state in states))
+        tools = [f" [{s.tool}]" if s.tool else "" for s, _ in states]
+        rows_text = zip(states, tools, strict=True)
+        print_text("\n".join(f"{state:5} {s.order} {s.name}: {s.text(language())}{t}" for (s, state), t in rows_text))
     return EXIT_OK
 
 

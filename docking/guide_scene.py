@@ -306,6 +306,8 @@ def tick(journal: Path, source: Source, step: str, by: str, *, done: bool) -> No
         raise BadArgument(
             "step", "it is done already" if states[step] == "done" else "another step is next", value=step
         )
+    if not done and states[step] != "done":
+        raise BadArgument("step", "it is not done", value=step)
     if not by.strip():
         raise BadArgument("--by", "who has done it must have a name", value=by)
     file = JournalFile(journal, time.monotonic)

@@ -128,7 +128,8 @@ def refuse_bent(ar_map: ArMap, layout: MarkerLayout, sightings: Sightings, setti
     circles, apart = triangulated(ar_map.keyframes, ar_map.camera, layout, sightings, settings)
     meet = {int(marker) for marker in circles.marker}
     if len(apart) >= max(2, len(meet)):
-        cause = f"the views of {len(apart)} of {len(apart) + len(meet)} markers do not meet: the map is bent"
+        cause = f"the views of {len(apart)} of {len(apart) + len(meet)} markers do not meet: the map is bent, "
+        cause += "the calibration is of another camera, or its poses are of other pictures"
         raise MapNotBuilt("markers", cause)
 
 

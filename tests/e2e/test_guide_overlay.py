@@ -214,6 +214,8 @@ def test_steps_are_ticked_off_in_order_and_journaled(
     assert [part.tone for part in scene.parts] == ["good", "next"]
     assert scene.parts[0].mesh is not None
     assert any("检查间隙" in text for text, _ in scene.steps)
+    assert call([*steps, "--undo", "check-gap", "--by", "A. Smith"]) == 2  # it is not done
+    capsys.readouterr()
     assert call([*steps, "--undo", "fit-bracket", "--by", "A. Smith"]) == 0
     assert [row["state"] for row in json.loads(capsys.readouterr().out)["steps"]] == ["next", "later"]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ pytest.importorskip("cv2", reason="the extra guidance is not installed")
 from docking.geometry import euler_to_matrix
 from docking.guidance.detection import Gate, MarkerDetector, MarkerSighting, planar_poses
 from docking.guidance.images import read_image
+from docking.guidance.map_methods import MethodSettings, method_settings
 from docking.guidance.marker_sheet import MarkerDrawing
 from docking.guidance.types import Camera, MarkerLayout
 from docking.types import Array, Pose
@@ -81,9 +83,24 @@ def test_the_gate_of_the_paper_is_distance_angle_and_four_circles() -> None:
     assert near.passes(Gate())
     assert not near.passes(Gate(distance_mm=440.0))
     assert not near.passes(Gate(angle_deg=7.0))
-    hidden = MarkerSighting(3, near.corners_px, np.where([[True], [False], [True], [True]], near.circles_px, np.nan))
+    hidden = replace(near, circles_px=np.where([[True], [False], [True], [True]], near.circles_px, np.nan))
     assert hidden.seen == 3
+    assert hidden.passes(Gate(circles=3))
     assert not hidden.passes(Gate())
+
+
+@pytest.mark.parametrize(
+    "gate", [Gate(), MethodSettings().registration.gate, method_settings("500,15,4").registration.gate]
+)
+def test_half_a_metre_and_fifteen_degrees_are_the_default(gate: Gate) -> None:
+    def stands(angle_deg: float, distance_mm: float) -> MarkerSighting:
+        X = _pose(angle_deg, 0.0, 0.0)
+        return MarkerSighting(3, np.zeros((4, 2)), np.zeros((4, 2)), (Pose(X.R, np.array([0.0, 0.0, distance_mm])),))
+
+    assert stands(14.9, 499.0).passes(gate)
+    assert not stands(15.1, 499.0).passes(gate)
+    assert not stands(14.9, 501.0).passes(gate)
+    assert not MarkerSighting(3, np.zeros((4, 2)), np.zeros((4, 2))).passes(gate)
 
 
 def test_a_hidden_circle_is_not_seen_and_half_of_one_neither() -> None:
