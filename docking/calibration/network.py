@@ -19,7 +19,6 @@ from docking.calibration.station import locate_station, to_world
 from docking.errors import NotCongruent, SigmaMissing, TooFewPoints
 from docking.pose.clique import adjacency, bits, largest_clique
 from docking.pose.layout import MIN_POINTS
-from docking.pose.pairs import pair_tolerance_mm
 from docking.pose.passes import average_passes
 from docking.pose.quantiles import chi2_tail, chi2_upper
 from docking.pose.reasons import explain
@@ -258,9 +257,8 @@ class _Snooping:
             covs = adjusted.points_cov_mm2[point], observations.cov_mm2[rows]
             names = tuple(self._book.points[j] for j in point)
             pairs = Pairs(names, adjusted.points_mm[point], observations.xyz_mm[rows], *covs)
-            tolerance = pair_tolerance_mm(pairs.nominal_mm, pairs.measured_mm, covs, FitSettings())
             out = [i for i, row in enumerate(rows) if row in self._wrong]
-            why = explain(pairs, adjusted.poses[k].inverse(), out, tolerance).rejected
+            why = explain(pairs, adjusted.poses[k].inverse(), out).rejected
             found += [replace(r, name=f"{self._book.stations[k]}: {r.name}") for r in why]
         lost = [row for row in self._wrong if not known[observations.point[row]]]
         return found + [Rejection(self._name(row), "undecided", "its other views disagree too") for row in lost]

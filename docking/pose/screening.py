@@ -19,7 +19,7 @@ from docking.pose.layout import MIN_POINTS, check_layout, spread
 from docking.pose.pairs import check_units, distances, estimated_sigma_mm, estimated_tolerance_mm, pair_tolerance_mm
 from docking.pose.passes import Averaged, average_passes
 from docking.pose.quantiles import chi2_tail
-from docking.pose.reasons import Reasons, explain
+from docking.pose.reasons import Reasons, events, explain
 from docking.pose.relabel import relabelled
 from docking.pose.settings import FitSettings
 from docking.pose.snooping import SMALLEST_SIGMA_MM, Pairs, Tested, all_agree, residuals_mm, snoop
@@ -124,10 +124,11 @@ def _screen_graph(pairs: Pairs, graph: _Graph, averaged: Averaged, settings: Fit
         pairs = _with_sigma(given, _posterior_sigma_mm(pairs, tested))
     inside = set(tested.kept)
     out = [i for i in range(len(pairs.names)) if i not in inside]
-    why = explain(pairs, tested.solution.X_MN, out, graph.tolerance_mm)
-    if not scaled or why.events:
+    why = explain(pairs, tested.solution.X_MN, out, tested.solution)
+    if not scaled or why.elsewhere:
         # Without stated sigmas the residuals set their own scale: nothing tells a deformed part from a coarse one.
-        _check_deformed(pairs, tested, why, settings)
+        moved = events(pairs, tested.solution.X_MN, why.elsewhere, graph.tolerance_mm)
+        _check_deformed(pairs, tested, (why, moved), settings)
     _check_unique(pairs, tested, rival, settings)
     _check_believable(graph, tested, why, settings)
     kept = pairs.rows(tested.kept)
@@ -224,7 +225,7 @@ def _mixed_up(pairs: Pairs, graph: _Graph, settings: FitSettings) -> NotCongruen
     if X is None:
         return None
     known = pairs if graph.sigma_mm is None else _with_sigma(pairs, graph.sigma_mm)
-    why = explain(known, X, list(range(len(pairs.names))), graph.tolerance_mm)
+    why = explain(known, X, list(range(len(pairs.names))))
     named = tuple(r for r in why.rejected if r.partner)
     cause = f"the labels are mixed up: {len(named)} of {len(pairs.names)} points are where another should be"
     error = NotCongruent(settings.where, cause, value=len(graph.clique), limit=settings.min_agreeing)
@@ -296,9 +297,12 @@ def _least_middle_mm(pairs: Pairs) -> float:
     return 0.02 * spread(pairs.nominal_mm).long_mm
 
 
-def _check_deformed(pairs: Pairs, tested: Tested, why: Reasons, settings: FitSettings) -> None:
+def _check_deformed(
+    pairs: Pairs, tested: Tested, told: tuple[Reasons, tuple[tuple[int, ...], ...]], settings: FitSettings
+) -> None:
     """Refuse a part whose points follow a smooth shape. Swapped, misplaced or misread points have nothing to say."""
-    found = deformation(pairs, tested, why.events)
+    why, moved = told
+    found = deformation(pairs, tested, moved)
     if found is not None:
         error = ComponentDeformed(settings.where, found.shape, value=found.largest_mm, limit=found.noise_mm)
         error.rejected = why.rejected
@@ -309,7 +313,7 @@ def _check_believable(graph: _Graph, tested: Tested, why: Reasons, settings: Fit
     """Refuse a set that chance could bring together, a minority where that is asked, and points put out one by one."""
     kept, n = len(tested.kept), len(graph.adj)
     chance = _accidental(graph, tested.kept)
-    unexplained = sum(map(len, why.events))
+    unexplained = len(why.elsewhere)
     error = None
     if 2 * kept <= n and not (chance <= _ACCIDENTS):
         cause = f"so many agree by chance: {chance:.2g} such sets are to be expected; another part, or sigmas too small"

@@ -1,7 +1,7 @@
 """How many wrong points the screening survives: Monte Carlo over layouts, kinds of error and numbers of points.
 
-A success is complete: every wrong point left out, no good point lost, and the pose at most 1.5 times as far off as the
-fit of the good points alone. A refusal is no success; refusals are counted by their error.
+A success is complete: every wrong point left out and named for what it is, no good point lost, and the pose at most 1.5
+times as far off as the fit of the good points alone. A refusal is no success; refusals are counted by their error.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from scipy import special
 from docking.errors import BadArgument, PoseError
 from docking.geometry import exp_so3
 from docking.pose import LASER_TRACKER, FitSettings, fit_pose, screen
-from docking.types import Array, Points, Pose, Screened
+from docking.types import Array, Points, Pose, Rejection, Screened
 
 Generator = np.random.Generator
 Say = Callable[[str], None]
@@ -53,16 +53,19 @@ CASES = (
     *(Case("slid", n, k) for n, k in ((7, 3), (10, 4), (15, 7), (20, 8))),
 )
 NOISES = ("isotropic", "tracker")
+REASONS = {"mis-aimed": "mis-aimed", "swapped": "swapped", "slid": "moved"}
+"""What the screening has to call the wrong points of each kind."""
 
 
 @dataclass(frozen=True)
 class Draw:
-    """One drawn set: `nominal` in C, `measured` in W, the true pose X_WC and the rows that are wrong."""
+    """One drawn set: `nominal` in C, `measured` in W, the true pose X_WC, the rows that are wrong and in what way."""
 
     nominal: Points
     measured: Points
     X_WC: Pose
     wrong: list[int]
+    kind: str
 
 
 def barrel(rng: Generator, n: int) -> Array:
@@ -106,11 +109,11 @@ def draw(rng: Generator, case: Case, noise: str) -> Draw:
     wrong = sorted(rng.permutation(case.n)[: case.wrong].tolist())
     spoil(rng, p, case.kind, wrong)
     names = tuple(f"T{i + 1}" for i in range(case.n))
-    return Draw(Points(names, j, np.zeros((case.n, 3, 3))), Points(names, p, cov), X, wrong)
+    return Draw(Points(names, j, np.zeros((case.n, 3, 3))), Points(names, p, cov), X, wrong, case.kind)
 
 
 def verdict(drawn: Draw, settings: FitSettings) -> str:
-    """`success`, or what went wrong: the refusal's error, `missed`, `good point rejected`, `pose`."""
+    """`success`, or what went wrong: the refusal's error, `missed`, `good point rejected`, `misnamed`, `pose`."""
     try:
         screened = screen(drawn.nominal, drawn.measured, settings)
     except PoseError as error:
@@ -120,8 +123,21 @@ def verdict(drawn: Draw, settings: FitSettings) -> str:
         return "missed"
     if out != set(drawn.wrong):
         return "good point rejected"
+    if not all(_named_right(drawn, rejection) for rejection in screened.rejected):
+        return "misnamed"
     mine, clean = (_off_mm(drawn, s, settings) for s in (screened, _good(drawn)))
     return "success" if mine <= WORST_POSE * clean else "pose"
+
+
+def _named_right(drawn: Draw, rejection: Rejection) -> bool:
+    """The reason is that of the kind of error; the partner of a swapped point is the one at whose place it was read."""
+    if rejection.reason != REASONS[drawn.kind]:
+        return False
+    if not rejection.partner:
+        return True
+    at = drawn.X_WC.inverse().apply(drawn.measured.xyz_mm[drawn.measured.names.index(rejection.name)])
+    nearest = int(np.argmin(np.linalg.norm(drawn.nominal.xyz_mm - at, axis=1)))
+    return rejection.partner == drawn.nominal.names[nearest]
 
 
 def _good(drawn: Draw) -> Screened:
@@ -189,12 +205,13 @@ def row_text(row: dict[str, Any]) -> str:
 
 
 MEANING = """\
-success              all wrong points left out, no good one lost, pose at most 1.5 times as far off as from the good
+success              all wrong points out and named, no good one lost, pose at most 1.5 times as far off as of the good
 AmbiguousSet         refused: another set of points agrees as well, and no choice is made
 NotCongruent         refused: no set agrees, or one that chance may have brought together
 ComponentDeformed    refused: the points follow a smooth shape
 missed               a wrong point was used
 good point rejected  by the test of single points, whose level is 1 % of clean sets
+misnamed             a wrong point is out, for another reason than it was wrong
 pose                 the right points, and yet a pose too far off"""
 
 
