@@ -1,4 +1,4 @@
-"""A stated temperature grows everything of a part: targets, features, balls, outline, and the mate's side by its own."""
+"""A stated temperature grows all of a part: targets, features, balls, outline, and the mate by its own."""
 
 from pathlib import Path
 
