@@ -35,8 +35,8 @@ ACKNOWLEDGE_S = 0.15
 ACKNOWLEDGE_SCANS = 3
 """A command that has arrived is acknowledged after the next scan: after so many it has not. The heartbeats of the other
 PLCs wait meanwhile."""
-ENABLE_S = 3.0
-LOOK_AGAIN_S = 0.005
+HOST_POLLS = 2.5  # to see that a host is alive
+ENABLE_S, LOOK_AGAIN_S = 3.0, 0.005
 RECONNECT_S, RECONNECT_FIRST_S, RECONNECT_MOST_S = 3.0, 0.05, 0.5
 """How long a broken connection is tried again, and the first and the longest wait between two tries."""
 REPEATABLE = frozenset(("hold", "stop", "quick-stop", "disable"))
@@ -97,6 +97,8 @@ class PositionerPlc:
         """
         await self.unit.connect()
         identity = await self._prove_identity()
+        if not self._heartbeat:
+            await self._require_no_host()
         await self.refresh()
         if self.state != "disabled" and self.state != "fault":
             await self.command("disable")
@@ -106,6 +108,14 @@ class PositionerPlc:
             await self.arm(settings)
         await self._prove_strokes()
         return identity
+
+    async def _require_no_host(self) -> None:
+        """The first write would disable the axes of whoever keeps this PLC alive: then its echo counts. LinkLost."""
+        before, _ = await self._read_block("status")
+        await asyncio.sleep(HOST_POLLS * self._bus.poll_s)
+        after, _ = await self._read_block("status")
+        if after["hb_echo"] != before["hb_echo"]:
+            raise LinkLost(self.where, "Another controller keeps it alive, nothing was written.")
 
     async def arm(self, settings: Mapping[str, int]) -> None:
         """Write and read back the settings, the watchdog among them, where this connection has not seen them yet.

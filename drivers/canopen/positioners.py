@@ -24,6 +24,7 @@ from docking.types import Array, Feedback, Identity, readonly
 from drivers.canopen import cia402, codec
 from drivers.canopen.bring_up import NodeBringUp, quantities
 from drivers.canopen.cia402 import DriveState
+from drivers.canopen.company import Company
 from drivers.canopen.cyclic import CyclicImage
 from drivers.canopen.homing import HomingGroup, HomingRules
 from drivers.canopen.keeper import Keeper
@@ -77,12 +78,13 @@ class CanopenPositioners:
     async def bring_up(self) -> tuple[Identity, ...]:
         """Prove identity and settings of every node; leave the axes disabled and reporting.
 
-        Raises PortMissing, DeviceSilent, WrongIdentity, ReadBackMismatch, DeviceRefused: each names the axis.
+        Raises PortMissing; LinkLost where another controller is heard; as `NodeBringUp.run`, naming the axis.
         """
         self._loop = asyncio.get_running_loop()
         self._link.on_frames, self._link.on_lost = self._on_frames, self._on_lost
         await self._link.open()
         self._open = True
+        await Company(self._nodes, self._map.host_node).require_none(self._link, self._bus.heartbeat_s, self._wire)
         self._send([codec.nmt(codec.NMT_PRE_OPERATIONAL, node.node) for node in self._nodes])
         identities = await self._together([self._prepare(setup) for setup in self._setups])
         self._send([codec.nmt(codec.NMT_START, node.node) for node in self._nodes])
@@ -151,9 +153,8 @@ class CanopenPositioners:
         if self._homing is None:
             raise ConfigInvalid(self._wire, ("homing: missing in the cell file",))
         if self._sequencing or self._live:
-            raise HomingRefused(
-                self._wire, "Its axes are being enabled, moved or homed.", value="busy", limit="at rest"
-            )
+            cause = "Its axes are being enabled, moved or homed."
+            raise HomingRefused(self._wire, cause, value="busy", limit="at rest")
         setups = [setup for setup in self._setups if setup.node.name in axes and setup.node.driven]
         watched = self._step, self._trouble, asked_to_stop, lambda: self.latest().force_n
         rules = HomingRules(self._homing, self._map, self._bus.counts_per_mm, *watched)

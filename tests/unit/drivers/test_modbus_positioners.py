@@ -105,6 +105,27 @@ def assert_on_one_path_time(bench: Bench, skew_s: float) -> None:
     assert np.abs(bench.plant.position_mm - common).max() <= speed * skew_s + 0.002
 
 
+def test_a_second_host_is_refused_and_the_move_of_the_first_goes_on() -> None:
+    """To bring a PLC up means to disable its axes first."""
+
+    async def scenario(bench: Bench) -> None:
+        await bench.run()
+        await bench.poll_for(1.0)
+        second = ModbusPositioners(bench.driver._cell)
+        refused = asyncio.ensure_future(second.bring_up())
+        feedback = await bench.poll_for(1.0)
+        with pytest.raises(LinkLost, match="Another controller") as caught:
+            await refused
+        assert caught.value.where == "positioner A"
+        await second.close()
+        feedback = await bench.poll_for(bench.plan.duration_s - 2.0 + 0.5)
+        assert feedback.fault is None
+        assert bench.states() == [State.DONE] * 4
+        assert bench.plant.position_mm == pytest.approx(bench.plan.q_mm[-1], abs=0.0006)
+
+    play(scenario)
+
+
 def test_a_whole_move_ends_on_the_last_row() -> None:
     async def scenario(bench: Bench) -> None:
         await bench.run()
