@@ -178,6 +178,20 @@ def test_the_end_of_the_channel_is_the_end_of_the_lease_at_once():
     play(scenario)
 
 
+def test_closing_in_a_move_stops_it_on_the_path_and_does_not_wait_for_its_end():
+    async def scenario(bench: Bench) -> None:
+        move = await bench.moving()
+        await asyncio.sleep(0.3)
+        begun_s = bench.loop.time()
+        await bench.motion.close()
+        assert bench.loop.time() - begun_s < min(1.5, 0.5 * PLAN.duration_s)
+        assert (await move).result == "stopped"
+        stopped_on_the_path(bench)
+        assert bench.bus.closed
+
+    play(scenario)
+
+
 @pytest.mark.parametrize("silently", [True, False])
 def test_a_motion_side_that_is_gone_is_named_everywhere(silently):
     async def scenario(bench: Bench) -> None:
