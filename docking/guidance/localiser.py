@@ -15,13 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from docking.errors import BadArgument, NotLocalised
-from docking.geometry import exp_so3
 from docking.guidance import guided
 from docking.guidance.features import Features, extract, grey
 from docking.guidance.frame_error import FrameError
 from docking.guidance.marker_pose import locate_by_markers
 from docking.guidance.opencv import opencv
-from docking.guidance.pose_only import CameraFit, Sights, focal_misfit, refine, seen_sigma_mm
+from docking.guidance.pose_only import CameraFit, Sights, focal_misfit, refine, second_pose, seen_sigma_mm
 from docking.guidance.types import ArMap, Camera, Image, MarkerLayout
 from docking.guidance.vocabulary import Bags, bags_of, train
 from docking.types import Array, Pose
@@ -37,10 +36,6 @@ _MOST_ADDED, _NEAR = 0.5, 0.2
 """Largest mean generation of the points that a pose may stand on, unless it is within so many depths of the hint."""
 _LIMITS = 1.5
 """A pose that could draw a corner of the picture off by so many times the limit is none."""
-_ENOUGH = 200
-"""So many points tell two poses apart."""
-_ALIKE, _APART = 1.25, 0.02
-"""A second pose fits too when its rms is at most so many times the first one's; so many depths away it is another."""
 _FOCUS, _FOCUS_SIGMAS = 0.01, 3.0
 """The picture may ask for a focal length that is so much another, or so many of its sigmas, and no more."""
 COVERAGE = 2.0
@@ -199,7 +194,7 @@ class Localiser:
     def _by_markers(self, image: Image, layout: MarkerLayout) -> Localised:
         fit, sights = locate_by_markers(grey(image), layout, self.camera)
         seen = int(np.count_nonzero(fit.inside))
-        if _second_pose(self.camera, fit, sights):
+        if second_pose(self.camera, fit, sights):
             raise self._refused("two poses fit the markers", seen, len(sights))
         depth = float(np.median(fit.X_WC.inverse().apply(sights.points_mm)[:, 2]))
         # A doubt about the markers of the map is one about these; away from those in view the pose swings.
@@ -285,7 +280,7 @@ class Localiser:
         p_C = fit.X_WC.inverse().apply(self.ar_map.points_mm[points[inside]])
         depth = float(np.median(p_C[:, 2]))
         sights = guided.sights(self.ar_map, features, rows, points)
-        if _second_pose(self.camera, fit, sights):
+        if second_pose(self.camera, fit, sights):
             raise self._refused("two poses fit what is seen, turned about the part in view", count, s.least_points)
         larger, sigma = focal_misfit(self.camera, fit, sights)
         if not abs(larger) <= max(_FOCUS, _FOCUS_SIGMAS * sigma):
@@ -306,29 +301,3 @@ class Localiser:
 
     def _refused(self, cause: str, count: int, needed: int) -> NotLocalised:
         return NotLocalised("image", cause, value=count, limit=needed)
-
-
-def _second_pose(camera: Camera, fit: CameraFit, sights: Sights) -> bool:
-    """Whether the points fit nearly as well from the pose mirrored at the line of sight.
-
-    A flat patch that fills little of the image looks nearly the same with its normal n and with n mirrored at the line
-    of sight s: the camera turned about the patch's middle by the rotation that takes n to 2 (n.s) s - n.
-    """
-    rows = np.flatnonzero(fit.inside)
-    patch = sights.where(rows[:: max(1, len(rows) // _ENOUGH)])
-    p_C = fit.X_WC.inverse().apply(patch.points_mm)
-    middle = p_C.mean(axis=0)
-    normal = np.linalg.svd(p_C - middle, full_matrices=False)[2][2]
-    toward = middle / np.linalg.norm(middle)
-    mirrored = 2.0 * float(normal @ toward) * toward - normal
-    turn = np.cross(normal, mirrored)
-    angle = float(np.arctan2(np.linalg.norm(turn), normal @ mirrored))
-    R = exp_so3(turn / max(float(np.linalg.norm(turn)), 1e-12) * angle)
-    start = fit.X_WC @ Pose(R, middle - R @ middle).inverse()
-    try:
-        other = refine(camera, start, patch)
-    except NotLocalised:
-        return False
-    apart = float(np.linalg.norm(other.X_WC.t_mm - fit.X_WC.t_mm))
-    alike = other.rms_px <= _ALIKE * fit.rms_px and np.count_nonzero(other.inside) >= len(patch) / _ALIKE
-    return bool(alike and apart > _APART * float(np.linalg.norm(middle)))

@@ -24,6 +24,11 @@ _STILL = 1e-5
 _BLOCKS = 4
 """The image is cut into _BLOCKS x _BLOCKS parts whose residuals count as one observation each in the covariance."""
 
+_ENOUGH = 200
+"""So many points tell two poses apart."""
+_ALIKE, _APART = 1.25, 0.02
+"""A second pose fits too when its rms is at most so many times the first one's; so many depths away it is another."""
+
 
 @dataclass(frozen=True, eq=False)
 class Sights:
@@ -178,3 +183,29 @@ def seen_sigma_mm(cov: Array, p_C: Array) -> float:
     across = np.linalg.svd(toward[None, :])[2][1:]
     D = across @ np.concatenate([skew(p_C), -np.eye(3)], axis=1)
     return float(np.sqrt(np.linalg.eigvalsh(D @ cov @ D.T)[-1]))
+
+
+def second_pose(camera: Camera, fit: CameraFit, sights: Sights) -> bool:
+    """Whether the points fit nearly as well from the pose mirrored at the line of sight.
+
+    A flat patch that fills little of the image looks nearly the same with its normal n and with n mirrored at the line
+    of sight s: the camera turned about the patch's middle by the rotation that takes n to 2 (n.s) s - n.
+    """
+    rows = np.flatnonzero(fit.inside)
+    patch = sights.where(rows[:: max(1, len(rows) // _ENOUGH)])
+    p_C = fit.X_WC.inverse().apply(patch.points_mm)
+    middle = p_C.mean(axis=0)
+    normal = np.linalg.svd(p_C - middle, full_matrices=False)[2][2]
+    toward = middle / np.linalg.norm(middle)
+    mirrored = 2.0 * float(normal @ toward) * toward - normal
+    turn = np.cross(normal, mirrored)
+    angle = float(np.arctan2(np.linalg.norm(turn), normal @ mirrored))
+    R = exp_so3(turn / max(float(np.linalg.norm(turn)), 1e-12) * angle)
+    start = fit.X_WC @ Pose(R, middle - R @ middle).inverse()
+    try:
+        other = refine(camera, start, patch)
+    except NotLocalised:
+        return False
+    apart = float(np.linalg.norm(other.X_WC.t_mm - fit.X_WC.t_mm))
+    alike = other.rms_px <= _ALIKE * fit.rms_px and np.count_nonzero(other.inside) >= len(patch) / _ALIKE
+    return bool(alike and apart > _APART * float(np.linalg.norm(middle)))

@@ -103,6 +103,17 @@ def test_half_hidden_is_still_localised(localiser: Localiser) -> None:
     assert np.linalg.norm(localiser.localise(image).X_WC.t_mm - HERE.t_mm) < 6.0
 
 
+def test_a_pose_that_leaves_a_corner_of_the_picture_uncertain_is_none(localiser: Localiser) -> None:
+    reach_mm = localiser.localise(picture(HERE)).corner_error_mm()
+    for limit_mm, refused in ((reach_mm / 1.4, False), (reach_mm / 1.6, True)):
+        strict = Localiser(localiser.index, settings=LocaliseSettings(by_markers=False, limit_mm=limit_mm))
+        if refused:
+            with pytest.raises(NotLocalised, match="corners"):
+                strict.localise(picture(HERE))
+        else:
+            assert strict.localise(picture(HERE)).corner_error_mm() == pytest.approx(reach_mm)
+
+
 def test_a_mirrored_picture_is_refused(localiser: Localiser) -> None:
     with pytest.raises(NotLocalised):
         localiser.localise(np.ascontiguousarray(picture(HERE)[:, ::-1]))

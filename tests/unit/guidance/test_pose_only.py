@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 
 from docking.geometry import log_so3
-from docking.guidance.pose_only import Sights, focal_misfit, jacobian, perturbed, refine, residuals, seen_sigma_mm
+from docking.guidance.pose_only import (
+    Sights,
+    focal_misfit,
+    jacobian,
+    perturbed,
+    refine,
+    residuals,
+    second_pose,
+    seen_sigma_mm,
+)
 from docking.guidance.types import Camera
 from docking.types import Array, Pose
 from sim.scenery import looking
@@ -110,3 +119,17 @@ def test_a_flat_wall_straight_ahead_says_nothing_about_the_focal_length() -> Non
     larger, sigma = focal_misfit(told, refine(told, X, sights), sights)
     assert abs(larger) < 3.0 * sigma
     assert sigma > 0.02
+
+
+@pytest.mark.parametrize(
+    ("half_mm", "stands_out_mm", "two"), [(30.0, 0.0, True), (300.0, 0.0, False), (30.0, 60.0, False)]
+)
+def test_a_small_flat_patch_fits_two_poses_a_large_or_deep_one_does_not(
+    half_mm: float, stands_out_mm: float, two: bool
+) -> None:
+    rng = np.random.default_rng(8)
+    at = np.column_stack([rng.uniform(-half_mm, half_mm, (150, 2)), rng.uniform(-stands_out_mm, 0.0, 150)])
+    X = looking(np.zeros(3), np.array([150.0, 100.0, -900.0]))
+    p_C = X.inverse().apply(at)
+    sights = Sights(at, CAMERA.project(p_C) + rng.normal(0.0, 0.8, (150, 2)), np.full(150, 0.8))
+    assert second_pose(CAMERA, refine(CAMERA, X, sights), sights) == two

@@ -63,6 +63,12 @@ def test_an_extended_map_stays_in_the_frame_of_the_cell() -> None:
     assert (
         found.predicted_error_mm() > 1.2 * localiser.localise(picture(view(100.0, 1000.0, 780.0))).predicted_error_mm()
     )
+    # After a loss what tracking has added tells no place, the map as built does.
+    with pytest.raises(NotLocalised):
+        tracker.step("dark", 1.0, np.zeros_like(image))
+    with pytest.raises(NotLocalised, match="added while tracking"):
+        tracker.step("there", 1.1, image)
+    assert tracker.step("home", 1.2, picture(view(100.0, 1000.0, 780.0))).generation < 0.5
 
 
 def test_a_fresh_map_takes_over_in_the_same_frame() -> None:
