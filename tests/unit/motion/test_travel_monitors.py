@@ -282,6 +282,18 @@ def test_a_passive_axis_may_drift_off_its_place_with_way_but_not_for_ever():
         assert 0.005 * k == pytest.approx(last, abs=0.006)
 
 
+def test_a_plan_that_is_loaded_begins_where_the_following_axes_stand():
+    """What they had come off their places by then is in the plan."""
+    bench, at = Bench(rc3()), np.zeros(12)
+    for k in range(60):
+        at = np.full(12, 0.1 * k)
+        assert bench.cycle(at + one(AXES.index("C.Y"), 0.005 * k), at) is None
+    at = at + one(AXES.index("C.Y"), 0.295)
+    bench.watch.watch_about(at)
+    assert bench.cycle(at, at, moving=False) is None
+    assert bench.cycle(at, at, moving=False) is None
+
+
 def test_distances_and_rms_of_the_balls_have_limits_of_their_own():
     stretched = np.zeros(12)
     stretched[[0, 9]] = -0.0749, -0.0749  # A and D along X: B and C stay 6 m away
