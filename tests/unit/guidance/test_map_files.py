@@ -156,6 +156,11 @@ def test_a_colmap_model_counts_pixels_from_the_corner(wall: Wall, tmp_path: Path
     assert model.camera == camera
     for frame in wall.free.keyframes:
         assert np.allclose(model.poses[frame.name].matrix(), frame.X_WC.matrix(), atol=1e-8)
+    first = wall.free.keyframes[0]
+    lines = [line for line in (tmp_path / "images.txt").read_text().splitlines() if not line.startswith("#")]
+    u, v, point = (float(text) for text in lines[1].split()[:3])
+    assert (u, v) == pytest.approx(first.keypoints_px[0] + 0.5, abs=1e-4)
+    assert point == (first.landmarks[0] + 1 if first.landmarks[0] >= 0 else -1)
 
 
 def test_a_binary_colmap_model_is_read(tmp_path: Path) -> None:
