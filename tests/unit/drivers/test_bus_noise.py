@@ -74,7 +74,10 @@ class Registers:
         """Nothing is written here."""
 
 
-NOISE = st.lists(st.tuples(st.floats(0.0, 0.02), st.binary(min_size=1, max_size=40)), max_size=4)
+LIKE_AN_ANSWER = st.binary(min_size=6, max_size=6).map(lambda rest: b"\x01\x03\x04" + rest)
+NOISE = st.lists(
+    st.tuples(st.floats(0.0, 0.02), st.binary(min_size=1, max_size=40) | LIKE_AN_ANSWER), min_size=1, max_size=4
+)
 """(after how long, bytes)."""
 
 
