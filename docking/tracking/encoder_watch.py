@@ -41,14 +41,16 @@ class EncoderWatch:
         self.frozen = False
         """Whether the read-backs stand still although the body moves."""
 
-    def read_back(self, t_s: float, place_mm: Array) -> None:
-        """One read-back: the body's points (n, 3) by it."""
+    def thawed(self, t_s: float, place_mm: Array) -> bool:
+        """One read-back, the body's points (n, 3) by it; True where it is the first of encoders that were frozen."""
         self._clock.good(t_s)
         same = self._place.shape == place_mm.shape and bool(np.all(self._place == place_mm))
         self._same, self._place = self._same + 1 if same else 0, place_mm
-        if not same:
-            self.frozen = False
-            self._alarms.gone(SensorFrozen, self._where)
+        if same:
+            return False
+        before, self.frozen = self.frozen, False
+        self._alarms.gone(SensorFrozen, self._where)
+        return before
 
     def silent(self, now_s: float) -> bool:
         """Whether no read-back has come for so long that the encoders have to count as lost."""

@@ -12,7 +12,7 @@ walk slowly: settling, temperature, compliance under changing load.
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -82,6 +82,7 @@ class EncoderTracker:
         self._poses: list[Pose] = []
         self._places: list[Array] = []
         self._origin: Array | None = None
+        self._thawed_s = float("-inf")
         self._frame_s = float("nan")
         self._used_s = float("nan")
         self._seen = np.zeros(len(body.names), dtype=bool)
@@ -95,8 +96,9 @@ class EncoderTracker:
     def encoders(self, t_s: float, X_WB: Pose) -> None:
         """One read-back; see `Tracker.encoders`."""
         place = X_WB.apply(self.body.points_B_mm)
-        if self._watch is not None:
-            self._watch.read_back(t_s, place)
+        if self._watch is not None and self._watch.thawed(t_s, place):
+            # While they stood still the body was followed by the image, as if it sat elsewhere.
+            self._p, self._thawed_s = self._p + self._begun, t_s
         if self._times and not (t_s > self._times[-1]):
             self.dropped += 1
             return
@@ -112,6 +114,8 @@ class EncoderTracker:
         if last == 0:
             return None
         first = bisect_right(self._times, t_s - self._s.smooth_s, 0, last)
+        if self._thawed_s <= t_s:  # no line through read-backs from before they stood still
+            first = max(first, bisect_left(self._times, self._thawed_s))
         first = min(first, last - 1)
         t = np.array(self._times[first:last])
         off, n = t - t.mean(), len(t)

@@ -227,6 +227,7 @@ class InertialTracker:
             return self._blind(head, t_s, sample)
         force, rate = 0.5 * (last.force + sample.force), 0.5 * (last.rate + sample.rate)
         nav, since = core.integrate(head.nav, head.since, t_s, force, rate)
+        since = self._carry.jolted(since, sample.force - last.force, dt)
         return Head(nav, head.cov, since, head.C_before, sample, head.seen, head.used_s)
 
     def _blind(self, head: Head, t_s: float, sample: Sample | None) -> Head:

@@ -24,6 +24,9 @@ from docking.types import Array
 P, V, PHI, BA, BG = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12), slice(12, 15)
 BASE = 15
 _EYE3 = np.eye(3)
+_KNOCK, _UNKNOWN_SHARE = 4.0, 0.5
+"""A knock changes the force between two samples by so many times the variance of noise; the share of such a change by
+which its push is uncertain, 1 sigma."""
 _LAG_KNOWN_S = 1e-3
 """A lag with a larger sd is none that was found."""
 
@@ -89,13 +92,15 @@ class Navigation(NamedTuple):
 
 class Since(NamedTuple):
     """Sums over the samples since the covariance was last carried on: duration, velocity gained by specific force, the
-    way that it brought, and in I the angle turned and the specific force times time."""
+    way that it brought, and in I the angle turned and the specific force times time. `jolt_mm2_s2`: variance of what
+    knocks between samples did to the velocity."""
 
     dt_s: float
     dv_mm_s: Array
     ds_mm: Array
     angle_rad: Array
     push_mm_s: Array
+    jolt_mm2_s2: float = 0.0
 
 
 NOTHING = Since(0.0, np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
@@ -104,7 +109,7 @@ NOTHING = Since(0.0, np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
 def integrate(nav: Navigation, since: Since, t_s: float, force: Array, rate: Array) -> tuple[Navigation, Since]:
     """Advance to `t_s` with the interval's mean specific force (mm/s^2) and rate (rad/s), both as measured."""
     _, p, v, C, force_bias, rate_bias, late, scale, force_scale, lever = nav
-    summed_s, summed_dv, summed_ds, summed_angle, summed_push = since
+    summed_s, summed_dv, summed_ds, summed_angle, summed_push, jolt = since
     dt = t_s - nav.t_s
     angle = dt * (rate - rate_bias)
     angle = angle + scale @ angle
@@ -118,7 +123,7 @@ def integrate(nav: Navigation, since: Since, t_s: float, force: Array, rate: Arr
         t_s, p + (v + 0.5 * gained) * dt, v + gained, after, force_bias, rate_bias, late, scale, force_scale, lever
     )
     ds = summed_ds + (summed_dv + 0.5 * dv) * dt
-    return moved, Since(summed_s + dt, summed_dv + dv, ds, summed_angle + angle, summed_push + push)
+    return moved, Since(summed_s + dt, summed_dv + dv, ds, summed_angle + angle, summed_push + push, jolt)
 
 
 def known_lag_s(nav: Navigation, cov: Array, layout: Layout) -> float:
@@ -168,7 +173,16 @@ class Propagation:
             phi[V, self._layout.force_scale], phi[P, self._layout.force_scale] = gained, (0.5 * dt) * gained
         after = phi @ cov @ phi.T
         self._add_noise(after, dt, float(since.angle_rad @ since.angle_rad))
+        after[self._i3 + 3, self._i3 + 3] += since.jolt_mm2_s2
         return phi, after
+
+    def jolted(self, since: Since, change_mm_s2: Array, dt: float) -> Since:
+        """What the force did between two samples is not known where they differ by far more than noise: a knock. Its
+        push is off the trapezoid's by a share of the difference."""
+        over = float(change_mm_s2 @ change_mm_s2) - _KNOCK * 6.0 * self._force / dt
+        if not (over > 0.0):
+            return since
+        return since._replace(jolt_mm2_s2=since.jolt_mm2_s2 + (_UNKNOWN_SHARE * dt) ** 2 * over / 3.0)
 
     def _add_noise(self, cov: Array, dt: float, angle2: float) -> None:
         i, v, a = self._i3, self._i3 + 3, self._force

@@ -171,3 +171,16 @@ def test_a_clock_that_stutters_is_told_once() -> None:
     twice = {key: getattr(recording, key)[rows] for key in ("imu_t_s", "force_m_s2", "rate_rad_s")}
     alarms, _ = run(replace(recording, **twice))
     assert [type(alarm) for alarm in alarms] == [TimeJumped]
+
+
+def test_knocks_too_short_for_the_samples_make_less_certain_and_do_not_lose_the_body() -> None:
+    """Twice a second one sample shows 60 m/s^2 of a shock that is over before the next: 0.3 m/s that nobody moved."""
+    recording, truth, _ = record(BODY, LENGTH_S)
+    force = recording.force_m_s2.copy()
+    rows = np.arange(400, len(force), 100)
+    force[rows] += 60.0 * np.random.default_rng(2).choice([-1.0, 1.0], (len(rows), 3))
+    alarms, path = run(replace(recording, force_m_s2=force), hide_from_s=6.0)
+    assert alarms == []
+    assert honest(path, truth)
+    calm = run(recording, hide_from_s=6.0)[1]
+    assert path.sd_mm[-1].max() > 3.0 * calm.sd_mm[-1].max()
