@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from docking.errors import PoseError
 from docking.pose import FitSettings, fit_pose, screen
 from docking.study.screening import CASES, NOISES, Case, draw, run_case
 from docking.types import Points, Pose
@@ -24,6 +25,20 @@ def test_few_good_points_name_the_wrong_ones_too(case: Case, noise: str) -> None
     verdicts = run_case(case, noise, 40, seed=3)["verdicts"]
     assert verdicts.get("misnamed", 0) <= 1, verdicts
     assert verdicts["success"] >= 36, verdicts
+
+
+def test_sigmas_stated_too_small_leave_no_minority_to_believe() -> None:
+    """Of ten clean points whose sigmas are a fifth of the truth a few agree by chance: that is no pose."""
+    rng, believed, causes = np.random.default_rng(4), 0, list[str]()
+    for _ in range(40):
+        w = draw(rng, Case("clean", 10, 0), "isotropic")
+        measured = Points(w.measured.names, w.measured.xyz_mm, w.measured.cov_mm2 / 25.0)
+        try:
+            believed += len(screen(w.nominal, measured, FitSettings()).names) <= 5
+        except PoseError as error:
+            causes.append(error.text())
+    assert believed <= 2
+    assert sum("by chance" in cause and "sigmas too small" in cause for cause in causes) >= 6
 
 
 @pytest.mark.full
