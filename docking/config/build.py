@@ -139,6 +139,7 @@ def jam_settings(cell: CellFile) -> JamSettings:
         passive_mm=limits.passive_mm,
         reaction_s=twice_s + bus.servo_lag_s,
         quick_floor_s=twice_s if queued else 0.0,
+        sampled_s=period_s,
         readings_s=READINGS * LOAD_CELL_CYCLES * period_s,
         residual_mm=limits.ball_residual_mm,
         force_n=limits.internal_force_n,

@@ -98,7 +98,7 @@ class JamBound:
     def reach_mm(self, speed_mm_s: Array) -> Array:
         """How far (m,) the others carry on past each axis that jams at `speed_mm_s` (m,) or slower."""
         after_s = self.settings.reaction_s + 0.5 * self.quick_stop_s(speed_mm_s)
-        by_encoder = self.seen_mm + speed_mm_s * after_s
+        by_encoder = self.seen_mm + speed_mm_s * (self._sampled_s + after_s)
         by_load_cell = self.tolerance_mm + speed_mm_s * (self.settings.readings_s + after_s)
         result: Array = np.fmin(by_encoder, by_load_cell)
         return result
@@ -135,6 +135,12 @@ class JamBound:
             found.append((float(factor[k]), f"{self.axes[k]} jammed: {what}"))
         return found
 
+    @property
+    def _sampled_s(self) -> Array:
+        """How late (m,) the read-back may come that shows it: the reaction to an axis with a set-point counts it."""
+        result: Array = np.where(self.driven, 0.0, self.settings.sampled_s)
+        return result
+
     def _limits(self) -> Iterator[tuple[Array, Array, str]]:
         """The tolerance of a held force is most of what a part may warp: load cells' limit bounds what its jam does."""
         jam, every = self.settings, np.ones(len(self.axes))
@@ -144,12 +150,12 @@ class JamBound:
 
     def _factor(self, v: Array, room: Array) -> Array:
         jam = self.settings
-        by_encoder = self._shrunk(v, room - self.seen_mm, jam.reaction_s)
+        by_encoder = self._shrunk(v, room - self.seen_mm, self._sampled_s + jam.reaction_s)
         by_load_cell = self._shrunk(v, room - self.tolerance_mm, jam.readings_s + jam.reaction_s)
         result: Array = np.fmin(by_encoder, by_load_cell)
         return result
 
-    def _shrunk(self, v: Array, room: Array, reaction_s: float) -> Array:
+    def _shrunk(self, v: Array, room: Array, reaction_s: Array | float) -> Array:
         """Stretch (m,) with which an axis stays inside `room` (m,) mm; next to endless where there is none."""
         room = np.maximum(room, 1.0 / _FREE_MM)
         ramp_s = float(np.max(v / self.a_quick_mm_s2))

@@ -73,13 +73,17 @@ class Lift:
 
     speed_mm_s: float
     share: float = 0.5
+    tight: bool = True
 
     @property
     def way_mm(self) -> float:
         return max(3.0, 3.0 * self.speed_mm_s)
 
     def scene(self) -> Scene:
-        return Scene("follower-force-can", seed=2, before=lambda cell: setattr(cell, "plan_from", self.plan))
+        off = PLAY if self.tight else ()
+        return Scene(
+            "follower-force-can", seed=2, before=lambda cell: setattr(cell, "plan_from", self.plan), errors_off=off
+        )
 
     def plan(self, standing_mm: Array) -> Plan:
         up = np.array([0.0, 0.0, self.way_mm])
@@ -88,20 +92,22 @@ class Lift:
 
 LIFTS = (
     Lift(8.0, 0.48),
-    Lift(0.3),
-    *(Lift(speed, share) for speed in (0.1, 0.2, 0.3, 0.5, 0.8, 8.0) for share in (0.35, 0.505)),
+    Lift(8.0, 0.48, tight=False),
+    *(Lift(v, share, tight) for v in (0.1, 0.2, 0.3, 0.5, 8.0) for share in (0.35, 0.505) for tight in (True, False)),
 )
-NOISE_N = 60.0
-"""What read-backs in micrometres and friction make of forces, whatever the axes do."""
+PLAY = ("ball_clearance", "backlash", "stick_slip", "repeatability")
+"""True errors that cases do without: the bound must hold for a part that sits tight."""
+PLAY_N = 150.0
+"""0.03 mm of clearance at 5 kN/mm: where there is play, an axis may stand so far on the other side when it jams."""
 SPAN = 1.5
 """The stated bound may be this much above the worst that is measured, as for axes that hold a position."""
 
 
 @pytest.mark.parametrize(
-    ("speed_mm_s", "kind", "within_s"), [(8.0, PassiveAxisTrip, 0.15), (0.1, BallUnloaded | PassiveAxisTrip, 0.85)]
+    ("speed_mm_s", "kind", "within_s"), [(8.0, PassiveAxisTrip, 0.2), (0.1, BallUnloaded | PassiveAxisTrip, 0.85)]
 )
 def test_jammed_it_stops_all_axes_on_the_path(speed_mm_s: float, kind: type[DockingError], within_s: float) -> None:
-    """At 0.83 mm/s its encoder tells after 0.1 mm, at 0.1 mm/s its load cell may after 0.05 mm."""
+    """At 0.6 mm/s its encoder tells after 0.1 mm, at 0.1 mm/s its load cell may after 0.05 mm."""
     cell, _ = move(Lift(speed_mm_s).scene(), "jam")
     assert isinstance(cell.cause, kind), repr(cell.cause)
     assert cell.cause.where == "D.Z"
@@ -121,10 +127,8 @@ def test_jammed_at_any_speed_it_strains_no_more_than_the_pre_flight_stated(reque
         stated_n, warp_n = float(cell.plan.bounds.jam_n[K]), float(cell.plan.bounds.jam_warp_n[K])
         worst_n = rise_n(cell, rows)
         peak = cell.plan.bounds.peak_mm_s[K]
-        print(
-            f"D.Z jammed at {peak:.2f} mm/s, {lift.share} of the way: {worst_n:.0f} of {stated_n:.0f} N; {cell.cause}"
-        )
-        assert worst_n <= stated_n + NOISE_N
+        print(f"D.Z jammed at {peak:.2f} mm/s, {lift}: {worst_n:.0f} of {stated_n:.0f} N; {cell.cause}")
+        assert worst_n <= stated_n + (0.0 if lift.tight else PLAY_N)
         assert warp_n == pytest.approx(stated_n, rel=0.01)
         assert warp_n <= 1.001 * cell.cell.limits.measured_warp_n
         shares.append(stated_n / worst_n)
@@ -136,8 +140,6 @@ def rise_n(cell: ReadyCell, rows: Array) -> float:
     return float(rows[:, 3].max() - rows[rows[:, 0] < cell.fault_s, 3].max())
 
 
-PLAY = ("ball_clearance", "backlash", "stick_slip", "repeatability")
-"""Play softens what the part feels; the bound must hold for a part that sits tight."""
 LEVEL = {"X": np.array([60.0, 0.0, 0.0]), "Y": np.array([0.0, 30.0, 0.0])}
 GUIDES = [
     pytest.param(name, axis, speed, id=f"{name}-{axis}-{speed}", marks=[] if few else [pytest.mark.full])
@@ -161,7 +163,7 @@ def test_a_guide_without_power_that_jams_strains_no_more_than_stated(name: str, 
     assert bounds is not None
     stated_n, worst_n = float(bounds.jam_n[k]), rise_n(cell, rows)
     print(f"{name} {axis} jammed at {bounds.peak_mm_s[k]:.2f} mm/s: {worst_n:.0f} of {stated_n:.0f} N; {cell.cause}")
-    assert worst_n <= stated_n + NOISE_N
+    assert worst_n <= stated_n
     assert stated_n <= min(SPAN * worst_n, 1.001 * cell.cell.limits.internal_force_n)
     assert beside_the_path_mm(cell) < AS_SENT_MM
     if speed_mm_s > 1.0:

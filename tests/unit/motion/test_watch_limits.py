@@ -61,3 +61,4 @@ def test_the_planner_counts_on_the_limits_that_the_monitors_have() -> None:
     assert (jam.force_n, jam.warp_n) == (watch.internal_force_n, watch.warp_force_n)
     assert jam.held_warp_n == watch.measured_warp_n
     assert jam.residual_mm == watch.ball_residual_mm
+    assert jam.sampled_s == cell.bus.cycle_s
