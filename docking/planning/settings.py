@@ -17,11 +17,11 @@ READINGS = 2
 class JamSettings:
     """How soon a jammed axis is met, and what it may cost.
 
-    It is seen when it hangs back by `stuck_mm` more than its lag, one without a set-point by the first of the read-backs,
-    `sampled_s` apart, that shows it `passive_mm` behind its place; the others go on for `reaction_s` and then ramp down
-    with the axes' a_quick, in `quick_floor_s` at least. An axis that holds a force is also seen by its load cell, within
-    `readings_s` of leaving its tolerance. `residual_mm` and `force_n` at the worst ball and `warp_n` are the limits;
-    `held_warp_n` where an axis that holds a force jams.
+    It is seen when it hangs back by `stuck_mm` more than its lag, one without a set-point by the first of the
+    read-backs, `sampled_s` apart, that shows it `passive_mm` behind its place; the others go on for `reaction_s` and
+    then ramp down with the axes' a_quick, in `quick_floor_s` at least. An axis that holds a force is also seen by its
+    load cell, within `readings_s` of leaving its tolerance. `residual_mm` and `force_n` at the worst ball and `warp_n`
+    are the limits; `held_warp_n` where an axis that holds a force jams.
     """
 
     stuck_mm: float = 0.02
