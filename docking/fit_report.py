@@ -17,6 +17,7 @@ from docking.point_file import read_points, read_weights
 from docking.pose import FitSettings, fit_pose, screen
 from docking.pose.locks import turning_axes
 from docking.pose.quantiles import chi2_tail, fisher_tail
+from docking.pose.snooping import SMALLEST_SIGMA_MM
 from docking.types import Array, Fit, Points, Pose, Rejection, Screened
 
 SIGMAS = ("alpha_deg", "beta_deg", "gamma_deg", "x_mm", "y_mm", "z_mm")
@@ -91,7 +92,10 @@ def _fits(screened: Screened, settings: FitSettings, sigmas_known: bool) -> tupl
     free = fit_pose(screened, replace(settings, locks=())) if settings.locks else fit
     if sigmas_known or not settings.weights or settings.method != "ml" or not (free.dof > 0):
         return fit, free
-    factor = max(free.chi2 / free.dof, np.finfo(np.float64).tiny)
+    weights = np.mean([dict(settings.weights).get(name, 1.0) for name in screened.names])
+    variance = np.trace(screened.nominal_cov_mm2 + screened.measured_cov_mm2, axis1=1, axis2=2).mean() / 3.0
+    # Exact points leave rounding, which is no scale.
+    factor = max(free.chi2 / free.dof, float(weights * SMALLEST_SIGMA_MM**2 / variance))
     scaled, free = (replace(f, cov=factor * f.cov, chi2=f.chi2 / factor) for f in (fit, free))
     return scaled, free
 
@@ -100,15 +104,14 @@ def locks_p(result: FitResult) -> float | None:
     """Probability that held values which are true enlarge chi-square so much; None where nothing was held.
 
     By chi-square with as many degrees of freedom as are held where the sigmas were stated, else by F against the
-    variance factor of the fit with nothing held.
+    variance factor of the fit with nothing held, which is 1 but for exact points: there rounding is no evidence.
     """
     if result.fit is None or result.free is None:
         return None
     held, more = result.fit.dof - result.free.dof, max(result.fit.chi2 - result.free.chi2, 0.0)
     if result.sigmas_known:
         return chi2_tail(more, held)
-    below = max(result.free.chi2 / result.free.dof, np.finfo(np.float64).tiny)
-    return fisher_tail(more / held / below, held, result.free.dof)
+    return fisher_tail(more / held / max(result.free.chi2 / result.free.dof, 1.0), held, result.free.dof)
 
 
 def centroid_cov(fit: Fit, centroid_M_mm: Array) -> Array:

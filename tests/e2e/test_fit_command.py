@@ -172,6 +172,10 @@ def test_held_values_are_judged(fitted: Fitted, noise: tuple[str, ...]) -> None:
     assert np.mean(levels) == pytest.approx(0.5, abs=4.0 * np.sqrt(1.0 / 12.0 / len(levels)))
     assert np.mean(np.array(levels) < 0.2) == pytest.approx(0.2, abs=4.0 * np.sqrt(0.16 / len(levels)))
     assert fitted(p, *noise, "--lock", "z=300.5")[1]["locks_p"] < 1e-6
+    for weights in ((), ("--weights", "T1=400,T2=3")):
+        exact = fitted(X.apply(J), *noise, *weights, "--lock", "z=300,beta=-2")[1]
+        assert exact["locks_p"] > 0.99
+        assert 1e-6 < exact["sigma"]["x_mm"] < 0.05
     assert fitted(p, *noise)[1]["locks_p"] is None
 
 
