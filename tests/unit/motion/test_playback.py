@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -128,6 +130,44 @@ def test_the_way_of_a_stop_is_half_its_ramp(site):
         playback.advance(CYCLE_S)
     ramp_s = 1.5 / plan.rate_slew_per_s
     assert playback.path_time_s - begun == pytest.approx(0.5 * ramp_s, abs=CYCLE_S)
+
+
+def test_between_rows_the_part_is_as_rigid_as_on_them():
+    """A table of ten turning rows: half way between two of them straight axes would squeeze the figure,
+    the set-points do not."""
+    site = rc1_site()
+    plan = a_plan(site, 5)
+    rows = np.linspace(0, len(plan.t_s) - 1, 12).round().astype(int)
+    coarse = replace(plan, t_s=float(rows[1]) * plan.period_s * np.arange(12), s=plan.s[rows], q_mm=plan.q_mm[rows],
+                     period_s=float(rows[1]) * plan.period_s)  # fmt: skip
+    playback = Playback(coarse)
+    where = site.positioners.origins_W_mm, site.positioners.axes_W
+    start = sockets_mm(*where, plan.q_mm[0])[0]
+    worst = {"set-points": 0.0, "chords": 0.0}
+    for at_s in coarse.period_s * (np.arange(1, 10) + 0.5):
+        for name, place in (("set-points", playback.setpoint_at(at_s)), ("chords", playback.chord_at(at_s))):
+            worst[name] = max(worst[name], float(rigid_gap_mm(start, sockets_mm(*where, place[None])).max()))
+    assert worst["chords"] > 4e-5
+    assert worst["set-points"] < 0.02 * worst["chords"]
+
+
+def test_a_hold_does_not_soften_a_harder_stop():
+    plan = a_plan(lab_site(), 3)
+    runs = []
+    for held in (False, True):
+        playback = Playback(plan)
+        for _ in range(len(plan.t_s) // 2):
+            playback.advance(CYCLE_S)
+        playback.stop_straight(20.0)
+        playback.advance(CYCLE_S)
+        if held:
+            playback.hold()
+        rates = [playback.rate]
+        while not playback.standing:
+            playback.advance(CYCLE_S)
+            rates.append(playback.rate)
+        runs.append(rates)
+    assert runs[0] == runs[1] == pytest.approx([0.8, 0.6, 0.4, 0.2, 0.0], abs=1e-9)
 
 
 def test_waiting_begins_at_rest():
