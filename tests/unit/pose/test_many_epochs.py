@@ -74,6 +74,8 @@ def test_what_leaves_the_rotation_open_is_refused_by_name() -> None:
     line[5] = np.outer(np.arange(10.0), (100.0, 50.0, 20.0))
     with pytest.raises(DegenerateTargets, match="epoch 5"):
         fit_poses(nominal, line)
+    with pytest.raises(DegenerateTargets, match="epoch 5005"):
+        fit_poses(nominal, np.concatenate([np.tile(measured[:1], (5000, 1, 1)), line]))
 
 
 @settings(max_examples=50, deadline=None)
