@@ -19,10 +19,13 @@ from docking.tracking.recording import Gap, Recording
 from docking.tracking.repaired import RepairedTracker
 from docking.tracking.replay import GapResult, Path, hidden, judged, play, smoothed_path, start_of
 from docking.tracking.smoothing import Tape
-from docking.tracking.time_offset import find_time_offset
+from docking.tracking.time_offset import find_time_offset, image_attitudes
 from docking.tracking.types import InertialModel, Tracker
 from docking.tracking.zero_velocity import ZeroVelocity
 
+LEAST_UP = 0.7
+"""Cosine of the largest angle between the mean specific force and the vertical: what moves and stops was pushed against
+gravity in the mean."""
 METHODS = ("published", "repaired", "ins", "ins-smoothed", "encoders", "auto")
 
 
@@ -82,6 +85,8 @@ def follow(recording: Recording, gaps: Sequence[Gap], settings: FollowSettings) 
     inertial = len(recording.imu_t_s) > 0
     late = find_time_offset(recording).late_s if inertial and settings.time_offset else 0.0
     used = replace(recording, imu_t_s=recording.imu_t_s - late)
+    if inertial:
+        _check_upright(used)
     choice, method = None, settings.method
     if method == "auto":
         longest = max((gap.length_s for gap in gaps), default=3.0)
@@ -125,3 +130,18 @@ def _check(recording: Recording, method: str) -> None:
         raise BadArgument("--method", "the recording has no inertial samples", value=method)
     if len(recording.imu_t_s) == 0 and len(recording.encoder_t_s) == 0:
         raise BadArgument(recording.name, "neither inertial samples nor encoders: nothing bridges a gap")
+
+
+def _check_upright(recording: Recording) -> None:
+    """Raises BadArgument where the specific force, turned by the attitudes that the image shows, does not point up: its
+    sign or its axes are not those that the header states."""
+    R, t = image_attitudes(recording), recording.frame_t_s
+    known = np.isfinite(R).all(axis=(1, 2)) & (t >= recording.imu_t_s.min()) & (t <= recording.imu_t_s.max())
+    if not known.any():
+        return
+    force = np.column_stack([np.interp(t[known], recording.imu_t_s, axis) for axis in recording.force_m_s2.T])
+    mean = np.einsum("mij,jk,mk->i", R[known], recording.body.X_BI.R, force) / int(known.sum())
+    if not (mean[2] >= LEAST_UP * float(np.linalg.norm(mean))):
+        told = ", ".join(f"{value:.2f}" for value in mean)
+        cause = "turned into W the mean specific force does not point up: its sign or axes are others than stated"
+        raise BadArgument(recording.name, cause, value=f"({told}) m/s^2")

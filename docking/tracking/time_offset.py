@@ -77,7 +77,7 @@ def _force_score(recording: Recording) -> Score:
 
 def _turning_score(recording: Recording) -> Score:
     """Length of the mean turning rate between frames `_STRIDE_S` apart: the image's against the gyroscope's."""
-    R, t, imu_t = _image_attitudes(recording), recording.frame_t_s, recording.imu_t_s
+    R, t, imu_t = image_attitudes(recording), recording.frame_t_s, recording.imu_t_s
     if len(t) < 2 or len(imu_t) < 2:
         return lambda late_s: float("nan")
     step = max(1, round(_STRIDE_S / float(np.median(np.diff(t)))))
@@ -103,7 +103,7 @@ def _turning_score(recording: Recording) -> Score:
     return score
 
 
-def _image_attitudes(recording: Recording) -> Array:
+def image_attitudes(recording: Recording) -> Array:
     """(M, 3, 3) as recorded, else by the pose of three points or more; NaN where the image shows none."""
     if np.isfinite(recording.attitude_WB).any():
         return recording.attitude_WB

@@ -182,6 +182,7 @@ def test_rest_is_held_and_creeping_is_not_taken_for_rest_when_said_so() -> None:
         return judged(replace(used, points_W_mm=shown), answer.path, gap, hide)[0].end_error_mm
 
     assert end(at_rest, place) < 1.0
+    assert follow(at_rest, [], FollowSettings("ins", m)).time_offset_s == 0.0  # at rest no lag shows
     creeping = place + np.array([8.0, 0.0, 0.0]) * at_rest.frame_t_s[:, None, None]
     assert end(at_rest, creeping, rest=False) < 12.0
 

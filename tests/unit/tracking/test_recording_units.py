@@ -10,6 +10,7 @@ import pytest
 from docking.errors import BadArgument, BadRecording
 from docking.recordings import read_recording
 from docking.track_report import gaps_of
+from docking.tracking.follow import FollowSettings, follow
 from docking.types import Array
 
 IMU = "t_s,fx_m_s2,fy_m_s2,fz_m_s2,wx_rad_s,wy_rad_s,wz_rad_s"
@@ -81,3 +82,14 @@ def test_frames_without_a_point_or_in_other_units_of_time_and_read_backs_of_anot
     encoders.write_text("t_s,x_mm,y_mm,z_mm,alpha_deg,beta_deg,gamma_deg\n700,0,0,0,0,0,0\n700.1,0,0,0,0,0,0\n")
     with pytest.raises(BadRecording, match="one clock"):
         read_recording([*paths, encoders])
+
+
+@pytest.mark.parametrize("turned", [(0.0, 0.0, -9.81), (9.81, 0.0, 0.0)])
+def test_a_specific_force_that_does_not_point_up_is_refused(tmp_path: Path, turned: tuple[float, ...]) -> None:
+    imu = samples()
+    settings = FollowSettings("repaired", time_offset=False)
+    imu[:, 1:] += np.random.default_rng(1).normal(0.0, 0.01, (len(imu), 6))
+    assert follow(read_recording(files(tmp_path, imu)), [], settings).alarms == []
+    imu[:, 1:4] += np.array(turned) - [0.0, 0.0, 9.81]
+    with pytest.raises(BadArgument, match="does not point up"):
+        follow(read_recording(files(tmp_path, imu)), [], settings)
