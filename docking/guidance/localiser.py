@@ -36,8 +36,9 @@ _MOST_ADDED, _NEAR = 0.5, 0.2
 """Largest mean generation of the points that a pose may stand on, unless it is within so many depths of the hint."""
 _LIMITS = 1.5
 """A pose that could draw a corner of the picture off by so many times the limit is none."""
-_FOCUS, _FOCUS_SIGMAS = 0.01, 3.0
-"""The picture may ask for a focal length that is so much another, or so many of its sigmas, and no more."""
+_FOCUS, _FOCUS_SIGMAS, _FOCUS_TOLD = 0.01, 3.0, 0.015
+"""The picture may ask for a focal length that is so much another, or so many of its sigmas, and no more; one that knows it
+with a larger sigma than the last is not asked: there the errors of lens and map decide, which all its points share."""
 COVERAGE = 2.0
 """Predicted errors are this many sigmas."""
 
@@ -283,7 +284,7 @@ class Localiser:
         if second_pose(self.camera, fit, sights):
             raise self._refused("two poses fit what is seen, turned about the part in view", count, s.least_points)
         larger, sigma = focal_misfit(self.camera, fit, sights)
-        if not abs(larger) <= max(_FOCUS, _FOCUS_SIGMAS * sigma):
+        if not (sigma > _FOCUS_TOLD or abs(larger) <= max(_FOCUS, _FOCUS_SIGMAS * sigma)):
             cause = f"the focal length is {100.0 * larger:+.1f} % off its calibration: another camera, zoom or focus?"
             raise self._refused(cause, count, count)
         generation = float(np.mean(self.index.generation[points[inside]]))
