@@ -18,11 +18,7 @@ from tests.support.dry_cell import CELLS, DryCell, run_dry
 
 NAMES = ("fuselage-can", "fuselage-modbus", "follower-can", "wing-modbus", "lab-can", "lab-modbus")
 SEEDS = (1, 2, 3)
-CASES = [
-    # The follower cell's moves are long: a guide without power may jam, which bounds their speed.
-    pytest.param(name, seed, marks=[pytest.mark.full] if (name, seed > 1) == ("follower-can", True) else [])
-    for name, seed in [*((name, seed) for name in NAMES for seed in SEEDS), ("follower-force-can", 1)]
-]
+CASES = [*((name, seed) for name in NAMES for seed in SEEDS), ("follower-force-can", 1)]
 KEYS = {
     "outcome",
     "tolerance_mm",
