@@ -37,8 +37,9 @@ _MOST_ADDED, _NEAR = 0.5, 0.2
 _LIMITS = 1.5
 """A pose that could draw a corner of the picture off by so many times the limit is none."""
 _FOCUS, _FOCUS_SIGMAS, _FOCUS_TOLD = 0.01, 3.0, 0.015
-"""The picture may ask for a focal length that is so much another, or so many of its sigmas, and no more; one that knows it
-with a larger sigma than the last is not asked: there the errors of lens and map decide, which all its points share."""
+"""The picture may ask for a focal length that is so much another, or so many of its sigmas, and no more; one that knows
+it with a larger sigma than the last is not asked: there the errors of lens and map decide, which all its points share.
+"""
 COVERAGE = 2.0
 """Predicted errors are this many sigmas."""
 
