@@ -39,11 +39,17 @@ class Activity(Generic[P]):
         self._devices: tuple[Device, ...] = ()
 
     def alarm(self, error: DockingError) -> None:
-        """Keep an error in the journal and tell the operator."""
+        """Keep an error in the journal and tell the operator; of one that ended a move, how the axes stopped, too."""
         alarm = error.alarm(self._clock(), stop=stop_of(self.progress.result, error))
         self.progress.alarms.append(alarm)
         self.journal.write("alarm", records.alarm_record(alarm))
         self.operator.notify("alarm", code=alarm.code, error=error)
+        ended = self.progress.result
+        if ended is None or ended.cause is not error or not ended.reaction:
+            return
+        self.operator.notify("stopped_by", kind=ended.reaction)
+        for other in ended.also:
+            self.operator.notify("also", error=other)
 
     async def close(self) -> None:
         """Release the devices, the positioners first; what goes wrong is told, and the rest is still released."""

@@ -145,6 +145,8 @@ def moved_record(plan: Plan, result: MoveResult) -> dict[str, Any]:
         "result": result.result,
         "path_time_s": result.path_time_s,
         "stop": stop_record(result.stop),
+        "reaction": result.reaction,
+        "also": [str(error) for error in result.also],
         "trace": {
             "t_s": trace.t_s.tolist(),
             "path_time_s": trace.path_time_s.tolist(),

@@ -395,7 +395,8 @@ class MoveResult:
     """How a move ended: `done`, `stopped` (on request, on the path) or `fault` (with its `cause`).
 
     `path_time_s` is where on the plan it ended, `commanded_mm` (m,) the last commanded axis positions, `stop` the times
-    of the stop that ended it, None where the plan ran to its end.
+    of the stop that ended it, None where the plan ran to its end. `reaction` names how all axes were stopped ("" where
+    nothing stopped them), `also` what was found behind the first cause.
     """
 
     result: str
@@ -407,6 +408,8 @@ class MoveResult:
     max_internal_force_n: float
     cause: Exception | None = None
     stop: StopTimes | None = None
+    reaction: str = ""
+    also: tuple[Exception, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ import sys
 from collections.abc import Callable
 from enum import Enum
 
-from docking.errors import AxisUnreferenced, BadArgument, EventRefused, StopOverdue
-from docking.motion.reactions import REACTIONS, REQUESTS, Mode, Reaction, document
+from docking.errors import AxisUnreferenced, BadArgument, DockingError, EventRefused, StopOverdue
+from docking.motion.reactions import REACTIONS, REQUESTS, WORDS, Mode, Reaction, document
 from docking.motion.triggers import Finding, Trigger
 
 __all__ = ["REACTIONS", "Arbiter", "Mode", "Reaction", "Role"]
@@ -86,6 +86,16 @@ class Arbiter:
     def latched(self) -> bool:
         """True while a fault is kept: nothing may start."""
         return self.first is not None
+
+    @property
+    def in_force(self) -> str:
+        """The name of the reaction that stops the axes or has stopped them; empty where nothing has."""
+        return WORDS[self.reaction][0] if self.reaction >= Reaction.PPS else ""
+
+    @property
+    def also(self) -> tuple[DockingError, ...]:
+        """What was found behind the first cause, in order."""
+        return tuple(finding.error for finding in self.later)
 
     def require_referenced(self) -> None:
         """Before the axes are enabled. Raises AxisUnreferenced while no supervisor has acknowledged a new reference."""

@@ -7,6 +7,7 @@ their ordinary ramp, everything harder their quick one, which ends with brakes a
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 
 import numpy as np
 
@@ -371,7 +372,8 @@ class QueuedMotion:
         if self.arbiter.mode is Mode.MOVING:
             self.arbiter.enter(Mode.STANDING)
         if not move.done.done():
-            move.done.set_result(move.result(outcome, path_time_s, self._commanded, cause))
+            ended = move.result(outcome, path_time_s, self._commanded, cause)
+            move.done.set_result(replace(ended, reaction=self.arbiter.in_force, also=self.arbiter.also))
 
 
 def _trigger_of(error: DockingError) -> Trigger:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
@@ -372,7 +373,8 @@ class StreamedMotion:
         if move is None:
             return
         cause = self.arbiter.first.error if self.arbiter.first is not None else None
-        result = move.result(outcome, self._setpoint, cause)
+        ended = move.result(outcome, self._setpoint, cause)
+        result = replace(ended, reaction=self.arbiter.in_force, also=self.arbiter.also)
         self._end()
         if not move.done.done():
             move.done.set_result(result)

@@ -13,8 +13,9 @@ from drivers.canopen.nodes import AxisNode
 
 _SET_POINTS: Final = (0x200, 0x300, 0x400, 0x500)
 """Identifiers of the set-points to a node, without its number (CiA 301, predefined connection set)."""
-BEATS = 2.5
-"""Heartbeats for which it is listened: one may be on the way."""
+SETTLE_BEATS, BEATS = 0.5, 2.0
+"""Heartbeats for which nothing counts yet, a controller that has just ended may have left frames on the wire; and for
+which it is listened then: one may be on the way."""
 
 
 class Company:
@@ -28,8 +29,10 @@ class Company:
 
     async def require_none(self, link: CanLink, heartbeat_s: float, where: str) -> None:
         """Listen on the open `link`; its `on_frames` is as before afterwards. Raises LinkLost."""
-        before, link.on_frames = link.on_frames, self._take
+        before, link.on_frames = link.on_frames, lambda batch: None
         try:
+            await asyncio.sleep(SETTLE_BEATS * heartbeat_s)
+            link.on_frames = self._take
             await asyncio.sleep(BEATS * heartbeat_s)
         finally:
             link.on_frames = before

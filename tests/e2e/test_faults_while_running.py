@@ -177,14 +177,24 @@ def test_a_tracker_that_sends_rubbish_is_named(tmp_path):
     assert run.left_on == []
 
 
-def test_a_node_lost_in_a_move_is_named_and_all_drives_stop(tmp_path):
-    run = run_dry("lab-can", 1, tmp_path, lambda run: mid_move(run, run.drives.mute, "C.Y"))
+@pytest.mark.parametrize("share", [0.46, 0.48, 0.5, 0.52])
+def test_a_node_lost_in_a_move_is_named_and_all_drives_stop(share, tmp_path):
+    run = run_dry("lab-can", 1, tmp_path, lambda run: mid_move(run, run.drives.mute, "C.Y", share=share))
     # The load cells may feel that one axis stands before three cycles of silence have passed; the silence is told then.
     kinds = (FeedbackMissing, DriveFault, BallForceTrip, ConsistencyTrip, InternalForceTrip, WarpTrip)
     assert_faulted(run, kinds, "C.Y")
     assert run.records("moved")[0]["result"] == "fault"
+    # A silent axis is not known to stand. Its heartbeat may be missed before the stop on the path has ended or after:
+    # the chain is opened, and every drive holds by its own watchdog, or all others are switched off.
+    moved = run.records("moved")[0]
     others = [axis for axis in run.left_on if axis != "C.Y"]
-    assert others == []
+    if moved["reaction"] == "hardware chain":
+        assert any("C.Y" in text and "no heartbeat" in text for text in moved["also"])
+        assert any("the controller has to be started again" in text for text in run.said)
+        assert len(others) == len(run.cell.axis_names) - 1
+    else:
+        assert moved["reaction"] == "fast path-preserving stop"
+        assert others == []
 
 
 @pytest.mark.parametrize(("state", "visit"), [("measure", 1), ("measure", 2), ("measure", 4)])
