@@ -188,7 +188,9 @@ def jam_bound(positioners: Positioners, q_mm: Array, settings: JamSettings, up: 
         out=np.full_like(force, np.nan),
         where=positioners.followers & (force > 0.0),
     )
-    seen = np.where(positioners.driven, settings.stuck_mm, settings.passive_mm)
+    # One that holds a force goes where its force is: only the force tells its jam.
+    beside = np.where(np.isnan(tolerance), settings.passive_mm, np.nan)
+    seen = np.where(positioners.driven, settings.stuck_mm, beside)
     costs = residual, force, warp, seen, tolerance
     return JamBound(positioners.axes, *costs, positioners.driven, positioners.a_quick_mm_s2, settings)
 

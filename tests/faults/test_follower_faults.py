@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from docking.errors import AxisDrift, AxisStuck, BallUnloaded, DockingError, EncoderJump, PassiveAxisTrip
+from docking.errors import AxisDrift, AxisStuck, BallUnloaded, EncoderJump, PassiveAxisTrip
 from docking.types import Array, Plan
 from tests.support.motion_record import AS_SENT_MM, along
 from tests.support.planned_moves import a_shift, lab_site
@@ -103,13 +103,11 @@ SPAN = 1.5
 """The stated bound may be this much above the worst that is measured, as for axes that hold a position."""
 
 
-@pytest.mark.parametrize(
-    ("speed_mm_s", "kind", "within_s"), [(8.0, PassiveAxisTrip, 0.2), (0.1, BallUnloaded | PassiveAxisTrip, 0.85)]
-)
-def test_jammed_it_stops_all_axes_on_the_path(speed_mm_s: float, kind: type[DockingError], within_s: float) -> None:
-    """At 0.6 mm/s its encoder tells after 0.1 mm, at 0.1 mm/s its load cell may after 0.05 mm."""
+@pytest.mark.parametrize(("speed_mm_s", "within_s"), [(8.0, 0.4), (0.1, 0.85)])
+def test_jammed_it_stops_all_axes_on_the_path(speed_mm_s: float, within_s: float) -> None:
+    """Its load cell tells after 0.05 mm, at 0.3 mm/s and at 0.1 mm/s, in two readings."""
     cell, _ = move(Lift(speed_mm_s).scene(), "jam")
-    assert isinstance(cell.cause, kind), repr(cell.cause)
+    assert isinstance(cell.cause, BallUnloaded), repr(cell.cause)
     assert cell.cause.where == "D.Z"
     assert cell.result is not None
     assert cell.result.stop is not None

@@ -267,6 +267,8 @@ class Watch:
         """Axes that follow the part: none is left behind by a jam, none has come off its place with time."""
         limits, beside_mm = self._limits, coupling.beside_mm
         left_mm = self._followed.off_mm(beside_mm, q_ref_mm[coupling.free])
+        # One that holds a force goes where its force is, not where nominal directions take it: its force is judged.
+        left_mm = np.where(self._positioners.followers[coupling.free], 0.0, left_mm)
         for monitor, off_mm, limit in (
             ("passive_axis", np.abs(left_mm), limits.passive_mm),
             ("passive_place", np.abs(beside_mm), limits.adrift_mm),
