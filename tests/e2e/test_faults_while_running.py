@@ -117,6 +117,8 @@ def test_a_jammed_axis_stops_all_on_the_path(name, share, axis, tmp_path):
     plan = run.plans[0]
     moved = run.records("moved")[0]
     assert moved["result"] == "fault"
+    assert moved["reaction"] == "fast path-preserving stop"
+    assert "all axes were stopped: fast path-preserving stop" in run.said
     assert 0.0 < moved["path_time_s"] < plan.duration_s
     # I9: when it was found, when the commands changed for it, when all stood.
     stop, begun_s = alarm["stop"], next(r["t_mono_s"] for r in run.all_records() if r["kind"] == "intent")

@@ -13,6 +13,7 @@ from docking.errors import JournalUnwritable
 from docking.journal import read
 from sim.virtual_time import run_virtual
 from tests.support.dry_cell import DryCell
+from tests.support.strained_cell import ReliefCase, Strained, relieved
 
 
 def test_a_move_whose_intent_the_disk_does_not_take_is_not_begun(
@@ -47,3 +48,27 @@ def test_a_move_whose_intent_the_disk_does_not_take_is_not_begun(
     assert len(table) > 100, "the axes were enabled and held"
     driven = ~np.isnan(table[0])
     assert np.ptp(table[:, driven], axis=0).max() == 0.0
+
+
+def test_a_relief_step_whose_intent_the_disk_does_not_take_is_not_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, asked = os.fdatasync, []
+
+    def fdatasync(fd: int) -> None:
+        if asked:
+            raise OSError(5, "Input/output error")
+        real(fd)
+
+    def asks(case: ReliefCase) -> None:
+        asked.append(case)
+
+    monkeypatch.setattr(os, "fdatasync", fdatasync)
+    with pytest.raises(JournalUnwritable, match="Input/output error"):
+        relieved(Strained("lab-can", 1, {"B.Z": 0.1}, each=asks), tmp_path / "run.jsonl")
+    (case,) = asked
+    kinds = [kind for kind, _ in case.records]
+    assert kinds.count("intent") == 1
+    assert "moved" not in kinds
+    at_intent = case.step_starts[0]
+    assert np.ptp(np.array(case.position_mm[at_intent:]), axis=0).max() < 1e-3
