@@ -264,6 +264,19 @@ def test_a_passive_axis_must_be_where_the_driven_ones_take_it(name):
             assert (found.error.where, found.error.limit) == (name, 0.1)
 
 
+def test_an_axis_that_holds_a_force_may_come_off_its_place_by_what_axis_directions_do():
+    """Its force tells a jam: 0.12 mm over a long approach are no reason to stop, half a millimetre is."""
+    held = 13400.0 * (np.arange(12) == AXES.index("D.Z"))
+    follower = replace(rc3(d_z_driven=False), held_n=held, held_tolerance_n=0.02 * held)
+    for off, trips in ((0.12, False), (-0.4, False), (0.51, True), (np.nan, True)):
+        bench, found = Bench(follower), None
+        for k in range(1, 101):
+            found = bench.cycle(one(AXES.index("D.Z"), off * k / 100), np.zeros(12))
+            if found is not None:
+                break
+        assert (found is not None) == trips, off
+
+
 def test_a_passive_axis_may_drift_off_its_place_with_way_but_not_for_ever():
     """Half a millimetre beside its place it has come off the part, however slowly; a jam is seen after a tenth."""
     free = np.flatnonzero(~rc3().driven)
